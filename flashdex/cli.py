@@ -1,0 +1,226 @@
+"""The `flashdex` command: one short function a verb, no logic.
+
+Exit codes: 0 done; 1 the answer is no (a replay that fails, something missing);
+2 a mistake in what was asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from flashdex.errors import FlashdexError
+
+Handler = Callable[[argparse.Namespace], int]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code.
+
+    Args:
+        argv: the words after `flashdex`; None reads the command line.
+    """
+    parser = make_parser()
+    args, rest = parser.parse_known_args(argv)
+    _take_overrides(parser, args, rest)
+    if args.debug:
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    logging.basicConfig(
+        level=logging.DEBUG if args.debug else logging.INFO,
+        format="%(asctime)s %(name)s: %(message)s",
+        datefmt="%H:%M:%S",
+    )
+    try:
+        return args.run(args)
+    except FlashdexError as error:
+        if args.debug:
+            raise
+        print(f"flashdex {args.verb}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _take_overrides(
+    parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]
+) -> None:
+    """Add words that argparse could not place to the overrides, or refuse them."""
+    flags = [word for word in rest if word.startswith("-")]
+    if rest and (flags or not hasattr(args, "overrides")):
+        hint = ""
+        if hasattr(args, "overrides"):
+            hint = "; values of the recipe are written key=value, without dashes"
+        parser.error(f"unknown: {' '.join(flags or rest)}{hint}")
+    if rest:
+        args.overrides += rest
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of all verbs."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument(
+        "--debug", action="store_true", help="tracebacks and more detailed logs"
+    )
+    parser = argparse.ArgumentParser(
+        prog="flashdex",
+        description="From recorded human hand-object motions to robot-hand "
+        "trajectories that hold up in physics.",
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:
+        verb = verbs.add_parser(name, help=text, description=text, parents=[common])
+        verb.set_defaults(run=run)
+        return verb
+
+    add("doctor", _doctor, "say what this computer has and what is missing")
+    add("ls", _ls, "list the recipes with the numbers they promise")
+    _add_recipe_verbs(add)
+    _add_run_verbs(add)
+    return parser
+
+
+def _add_recipe_verbs(
+    add: Callable[[str, Handler, str], argparse.ArgumentParser],
+) -> None:
+    verb = add("cp", _cp, "copy a recipe to edit it")
+    verb.add_argument("recipe", help="name or path")
+    verb.add_argument("dest", help="new file or folder")
+
+    verb = add("validate", _validate, "find every mistake in recipes")
+    verb.add_argument("paths", nargs="+", metavar="PATH", help="recipe or folder")
+
+    verb = add("prepare", _prepare, "make a motion library from recordings")
+    verb.add_argument("--source", required=True, help="reader of the recordings")
+    verb.add_argument("--input", type=Path, help="folder or file of recordings")
+    verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
+    verb.add_argument("--out", type=Path, required=True, help="folder of the library")
+    verb.add_argument("--hz", type=float, default=60.0, help="control rate, 1/s")
+    verb.add_argument("--workers", type=int, default=0, help="processes; 0 = all cores")
+    verb.add_argument("--limit", type=int, help="only the first N recordings")
+    verb.add_argument("--seed", type=int, default=0)
+
+
+def _add_run_verbs(
+    add: Callable[[str, Handler, str], argparse.ArgumentParser],
+) -> None:
+    verb = add("train", _train, "train a recipe: train RECIPE key=value ...")
+    verb.add_argument("recipe", nargs="?", help="name or path")
+    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    verb.add_argument("--resume", type=Path, metavar="RUN", help="continue a run")
+    verb.add_argument(
+        "-m", "--multirun", action="store_true", help="one run for each of key=a,b"
+    )
+    verb.add_argument(
+        "--cfg", choices=["job"], help="print the composed recipe and stop"
+    )
+
+    verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
+    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("overrides", nargs="*", metavar="key=value")
+
+    verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
+    verb.add_argument("run_dir", type=Path, metavar="RUN")
+
+    verb = add("bench", _bench, "measure; prints JSON")
+    verb.add_argument("what", choices=["env"], help="what to measure")
+    verb.add_argument("overrides", nargs="*", metavar="key=value")
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from flashdex.doctor import examine, format_report
+
+    findings = examine()
+    print(format_report(findings))
+    return int(any(finding.status == "missing" for finding in findings))
+
+
+def _ls(args: argparse.Namespace) -> int:
+    from flashdex.recipe.store import format_listing, list_recipes
+
+    print(format_listing(list_recipes()))
+    return 0
+
+
+def _cp(args: argparse.Namespace) -> int:
+    from flashdex.recipe import copy_recipe
+
+    print(copy_recipe(args.recipe, args.dest))
+    return 0
+
+
+def _validate(args: argparse.Namespace) -> int:
+    from flashdex.recipe.validate import validate_paths
+
+    for path in validate_paths(args.paths):
+        print(f"ok  {path}")
+    return 0
+
+
+def _prepare(args: argparse.Namespace) -> int:
+    from flashdex.motions.prepare import prepare
+
+    prepare(
+        source=args.source,
+        input=args.input,
+        hand=args.hand,
+        out=args.out,
+        hz=args.hz,
+        workers=args.workers,
+        limit=args.limit,
+        seed=args.seed,
+    )
+    return 0
+
+
+def _train(args: argparse.Namespace) -> int:
+    from flashdex.recipe import compose, compose_runs, dump_recipe
+
+    if args.resume is not None:
+        from flashdex.training.run import resume
+
+        first = [args.recipe] if args.recipe else []
+        resume(args.resume, first + args.overrides)
+        return 0
+    if args.recipe is None:
+        raise FlashdexError("give a recipe (see `flashdex ls`) or --resume RUN")
+    if args.multirun:
+        recipes = compose_runs(args.recipe, args.overrides)
+    else:
+        recipes = [compose(args.recipe, args.overrides)]
+    if args.cfg:
+        print("---\n".join(dump_recipe(recipe) for recipe in recipes), end="")
+        return 0
+    from flashdex.training.run import train
+
+    for recipe in recipes:
+        train(recipe)
+    return 0
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from flashdex.training.evaluate import evaluate
+
+    evaluate(args.run_dir, args.overrides)
+    return 0
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from flashdex.training.replay_run import replay
+
+    return 0 if replay(args.run_dir) else 1
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from flashdex.bench.env import main as bench_env
+
+    bench_env(args.overrides)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

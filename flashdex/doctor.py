@@ -1,0 +1,183 @@
+"""What this computer has of what flashdex can use: versions, GPU, GL, disk, extras."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+import flashdex
+
+Status = Literal["ok", "note", "missing"]
+
+# Renders one small picture; a back end that only imports is no back end.
+_RENDER = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/>"
+    "<geom type='box' size='.1 .1 .1' rgba='1 0 0 1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    assert renderer.render().max() > 0
+"""
+_GL_PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    status: Status
+    """ok; note = works, with a limit; missing = flashdex will not run."""
+    what: str
+    """Subject."""
+    detail: str
+    """What was found, and what to do about it."""
+
+
+def examine() -> list[Finding]:
+    """Look at everything; a missing package is a finding, never an exception."""
+    return [
+        _python(),
+        *_packages(),
+        _cpu(),
+        _gpu(),
+        _graphics(),
+        _disk(Path.cwd()),
+        *_extras(),
+    ]
+
+
+def format_report(findings: list[Finding]) -> str:
+    """Lay the findings out as a table."""
+    width = max(len(f.what) for f in findings)
+    signs = {"ok": "ok     ", "note": "note   ", "missing": "MISSING"}
+    lines = [f"{signs[f.status]}  {f.what:<{width}}  {f.detail}" for f in findings]
+    return "\n".join(lines)
+
+
+def _python() -> Finding:
+    version = platform.python_version()
+    status: Status = "ok" if sys.version_info >= (3, 11) else "missing"
+    return Finding(
+        status, "python", f"{version} on {platform.system()} {platform.machine()}"
+    )
+
+
+def _requirements() -> list[tuple[str, str]]:
+    """Return (package, extra) of the installed flashdex, extra "" for the core."""
+    try:
+        lines = metadata.requires("flashdex") or []
+    except metadata.PackageNotFoundError:
+        return []
+    pairs = []
+    for line in lines:
+        name = re.split(r"[<>=!~;\[ ]", line, maxsplit=1)[0]
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
+        pairs.append((name, extra.group(1) if extra else ""))
+    return pairs
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _packages() -> list[Finding]:
+    core = [name for name, extra in _requirements() if not extra]
+    if not core:
+        detail = f"{flashdex.__version__}, not installed: pip install --editable ."
+        return [Finding("note", "flashdex", detail)]
+    found = [Finding("ok", "flashdex", flashdex.__version__)]
+    for name in core:
+        version = _version(name)
+        if version is None:
+            found.append(Finding("missing", name, f"run: pip install {name}"))
+        else:
+            found.append(Finding("ok", name, version))
+    return found
+
+
+def _cpu() -> Finding:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    cores = usable or os.cpu_count() or 1
+    memory = ""
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        memory = f", {size / 2**30:.0f} GiB memory"
+    return Finding("ok", "cpu", f"{cores} cores{memory}")
+
+
+def _gpu() -> Finding:
+    try:
+        import torch
+    except ImportError:
+        return Finding("missing", "gpu", "torch is not installed")
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_properties(0)
+        size = device.total_memory / 2**30
+        count = torch.cuda.device_count()
+        return Finding("ok", "gpu", f"{count} x {device.name}, {size:.0f} GiB")
+    reason = "this torch is a CPU build" if torch.version.cuda is None else "no device"
+    return Finding("note", "gpu", f"none ({reason}): use physics=cpu")
+
+
+def _graphics() -> Finding:
+    """Render one picture with each off-screen back end until one works."""
+    asked = os.environ.get("MUJOCO_GL")
+    tried = [asked] if asked else ["egl", "osmesa"]
+    for backend in tried:
+        try:
+            result = subprocess.run(
+                [sys.executable, "-c", _RENDER],
+                env={**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend},
+                capture_output=True,
+                timeout=60,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            continue
+        if result.returncode == 0:
+            hint = "" if asked else f" (export MUJOCO_GL={backend})"
+            return Finding("ok", "graphics", f"{backend} renders{hint}")
+    packages = " or ".join(_GL_PACKAGES.get(b, b) for b in tried)
+    return Finding(
+        "note",
+        "graphics",
+        f"none of {', '.join(tried)} renders: no films, training is not affected. "
+        f"Install {packages} (apt-get install ...)",
+    )
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free / 2**30
+    status: Status = "ok" if free > 5 else "note"
+    return Finding(status, "disk", f"{free:.0f} GiB free in {folder}")
+
+
+def _extras() -> list[Finding]:
+    """List the extras of which a package is missing, with the command."""
+    extras: dict[str, list[str]] = {}
+    for name, extra in _requirements():
+        if extra:
+            extras.setdefault(extra, []).append(name)
+    found = []
+    for extra, names in extras.items():
+        absent = [name for name in names if _version(name) is None]
+        if absent:
+            detail = f"without {', '.join(absent)}: pip install 'flashdex[{extra}]'"
+            found.append(Finding("note", f"extra {extra}", detail))
+        else:
+            found.append(Finding("ok", f"extra {extra}", ", ".join(names)))
+    return found

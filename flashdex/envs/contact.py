@@ -1,0 +1,55 @@
+"""Contact wrench of each link, coded in seven bytes.
+
+What physics alone knows has to be stored in replay, next to the state. A link's
+contact with the object of its hand is one net force and one force-weighted point;
+seven signed bytes hold it: direction (3), log magnitude (1), point in the link's
+frame (3). The environment emits the codes, so that the policy and the replay sample
+decode the very same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+CODE_WIDTH = 7
+MAX_FORCE = 500.0  # N; larger forces saturate
+POINT_RANGE = 0.1  # m; links are shorter than this around their frame
+_LOG_MAX = math.log1p(MAX_FORCE)
+
+
+def encode_contact(force: Tensor, point: Tensor) -> Tensor:
+    """Code forces and points; links without contact give all zeros.
+
+    Args:
+        force: net contact force on the link, link frame, N, (..., 3).
+        point: force-weighted contact point, link frame, m, (..., 3).
+
+    Returns:
+        int8 codes, (..., 7).
+    """
+    size = force.norm(dim=-1, keepdim=True)
+    direction = force / size.clamp_min(1e-9)
+    magnitude = (torch.log1p(size) / _LOG_MAX).clamp(max=1.0)
+    code = torch.cat([direction, magnitude, point / POINT_RANGE], -1)
+    code = torch.round(code.clamp(-1, 1) * 127)
+    return torch.where(size > 1e-6, code, torch.zeros_like(code)).to(torch.int8)
+
+
+def decode_contact(code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Invert ``encode_contact``.
+
+    Args:
+        code: int8 codes, (..., 7).
+
+    Returns:
+        Unit direction (..., 3), ``log(1 + force)`` (..., 1) with the force in N,
+        and the contact point in the link frame, m, (..., 3).
+    """
+    value = code.float() / 127
+    direction = value[..., :3]
+    size = direction.norm(dim=-1, keepdim=True)
+    direction = direction / size.clamp_min(1e-6)
+    return direction, value[..., 3:4] * _LOG_MAX, value[..., 4:] * POINT_RANGE

@@ -1,0 +1,193 @@
+"""The motion library as tensors that an environment step can gather from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from flashdex import keys
+from flashdex.geometry.sdf import SdfGrid
+from flashdex.hands.spec import HandSpec
+from flashdex.motions.library import MotionLibrary
+
+
+@dataclass(frozen=True)
+class _Field:
+    """One column range of the packed table and the shape it is read back with."""
+
+    start: int
+    stop: int
+    shape: tuple[int, ...]
+
+
+class ReferenceBank(nn.Module):
+    """Reference frames, packed so that any (motion, frame) costs one gather.
+
+    Every per-frame quantity lies side by side in one wide table; reading the state
+    of N worlds is a single ``index_select`` and a few views. Quantities of "the
+    object of a hand" are resolved here, once, so that no later code looks up slots.
+
+    Args:
+        library: the prepared motions.
+        hands: both sides of the robot hand, used for the mapped keypoints.
+
+    Attributes:
+        hand_active: hand takes part in the motion, (M, 2) bool.
+        hand_slot: object slot of each hand, 0 where it has none, (M, 2) int64.
+        hand_object: object row of each hand, 0 where it has none, (M, 2) int64.
+    """
+
+    def __init__(self, library: MotionLibrary, hands: dict[str, HandSpec]) -> None:
+        super().__init__()
+        self._fields: dict[str, _Field] = {}
+        frames, motions = library.frames, library.motions
+        start = motions["start"].long()
+        length = motions["length"].long()
+        active = motions["hand_active"].bool()
+        slot = motions["hand_object"].long()
+        rows = motions["object_index"].long()
+        motion_of_frame = torch.repeat_interleave(torch.arange(len(start)), length)
+        columns = self._columns(frames, slot[motion_of_frame], hands)
+        self.register_buffer("table", self._pack(columns))
+        self.register_buffer("start", start)
+        self.register_buffer("length", length)
+        self.register_buffer("hand_active", active)
+        self.register_buffer("has_object", (slot >= 0) & active)
+        self.register_buffer("hand_slot", slot.clamp_min(0))
+        self.register_buffer("object_index", rows)
+        own = torch.gather(rows, 1, slot.clamp_min(0)).clamp_min(0)
+        self.register_buffer("hand_object", own)
+        objects = library.objects
+        self.register_buffer("points", objects["points"].float())
+        self.register_buffer("radius", objects["radius"].float())
+        self.register_buffer("mass", objects["mass"].float())
+        self.register_buffer("inertia", objects["inertia"].float())
+        self.register_buffer("com", objects["com"].float())
+        self.sdf = SdfGrid(
+            objects["sdf"].float(),
+            objects["sdf_origin"].float(),
+            objects["sdf_spacing"].float(),
+        )
+        self.names = list(library.names)
+        self.fps = float(library.fps)
+
+    @property
+    def num_motions(self) -> int:
+        """Motions in the collection."""
+        return len(self.start)
+
+    @property
+    def num_slots(self) -> int:
+        """Object slots of a world."""
+        return self.object_index.shape[1]
+
+    @property
+    def num_joints(self) -> int:
+        """Joints of one hand, wrist included."""
+        return self._fields["joint_pos"].shape[-1]
+
+    def at(self, motion: Tensor, frame: Tensor, names: tuple[str, ...] = ()) -> TensorDict:
+        """Gather reference frames; frames past the end clamp to the last one.
+
+        Args:
+            motion: motion rows, any shape B, int64.
+            frame: frame within the motion, shape B, int64.
+            names: fields to return; all when empty.
+
+        Returns:
+            TensorDict of batch size B with the fields of the packed table.
+        """
+        frame = torch.minimum(frame.clamp_min(0), self.length[motion] - 1)
+        index = self.start[motion] + frame
+        rows = self.table.index_select(0, index.reshape(-1))
+        rows = rows.reshape(*index.shape, -1)
+        out = {
+            name: rows[..., f.start : f.stop].unflatten(-1, f.shape)
+            for name, f in self._fields.items()
+            if not names or name in names
+        }
+        return TensorDict(out, batch_size=index.shape)
+
+    def window(self, motion: Tensor, frame: Tensor, horizon: int) -> TensorDict:
+        """Gather ``horizon`` consecutive frames that begin at ``frame``.
+
+        Args:
+            motion: motion rows, (N,), int64.
+            frame: first frame, (N,), int64.
+            horizon: number of frames K.
+
+        Returns:
+            TensorDict of batch size (N, K) with the fields of the future window.
+        """
+        steps = torch.arange(horizon, device=frame.device)
+        frames = frame.unsqueeze(-1) + steps
+        return self.at(motion.unsqueeze(-1).expand_as(frames), frames, _WINDOW_FIELDS)
+
+    def _columns(
+        self, frames: TensorDict, slot: Tensor, hands: dict[str, HandSpec]
+    ) -> dict[str, Tensor]:
+        take = slot.clamp_min(0)
+
+        def own(name: str) -> Tensor:
+            values = frames[name].float()
+            index = take.unsqueeze(-1).expand(-1, -1, values.shape[-1])
+            return torch.gather(values, 1, index)
+
+        tips = list(keys.TIP_KEYPOINTS)
+        mapped = [[k for _, k in hands[s].keypoint_links] for s in keys.SIDES]
+        pick = torch.tensor(mapped)
+        pick = pick[None, :, :, None].expand(frames.shape[0], -1, -1, 3)
+        keypoints = frames["keypoints"].float()
+        keypoint_vel = frames["keypoint_linvel"].float()
+        per_hand = {
+            name: frames[name].float()
+            for name in (
+                "joint_pos",
+                "joint_vel",
+                "wrist_pos",
+                "wrist_quat",
+                "wrist_linvel",
+                "wrist_angvel",
+                "tip_dist",
+            )
+        }
+        return {
+            **per_hand,
+            "tip_pos": keypoints[:, :, tips],
+            "tip_linvel": keypoint_vel[:, :, tips],
+            "link_pos": torch.gather(keypoints, 2, pick),
+            "link_linvel": torch.gather(keypoint_vel, 2, pick),
+            "own_pos": own("object_pos"),
+            "own_quat": own("object_quat"),
+            "own_linvel": own("object_linvel"),
+            "own_angvel": own("object_angvel"),
+            "object_pos": frames["object_pos"].float(),
+            "object_quat": frames["object_quat"].float(),
+            "object_linvel": frames["object_linvel"].float(),
+            "object_angvel": frames["object_angvel"].float(),
+        }
+
+    def _pack(self, columns: dict[str, Tensor]) -> Tensor:
+        offset, flat = 0, []
+        for name, values in columns.items():
+            shape = tuple(values.shape[1:])
+            width = math.prod(shape)
+            self._fields[name] = _Field(offset, offset + width, shape)
+            flat.append(values.reshape(len(values), width))
+            offset += width
+        return torch.cat(flat, -1).contiguous()
+
+
+_WINDOW_FIELDS = (
+    "own_pos",
+    "own_quat",
+    "own_linvel",
+    "own_angvel",
+    "wrist_pos",
+    "wrist_quat",
+    "tip_pos",
+)

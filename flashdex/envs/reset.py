@@ -1,0 +1,102 @@
+"""Start states: reference frame plus noise (method section 10)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.samplers import start_frames
+
+if TYPE_CHECKING:
+    from flashdex.recipe import ResetNoise
+
+
+@dataclass(frozen=True)
+class ResetDraw:
+    """What a reset of n worlds has drawn.
+
+    Attributes:
+        motion: motion rows, (n,).
+        frame: start frames, (n,).
+        pos_noise: added to the joint positions, m and rad, (n, 2, J).
+        vel_noise: added to the wrist velocity, (n, 2, 6).
+        finger_vel: replaces the finger velocity, rad/s, (n, 2, J - 6); NaN keeps it.
+    """
+
+    motion: Tensor
+    frame: Tensor
+    pos_noise: Tensor
+    vel_noise: Tensor
+    finger_vel: Tensor
+
+
+def draw_reset(
+    motion: Tensor,
+    from_start: Tensor,
+    noiseless: Tensor,
+    length: Tensor,
+    noise: ResetNoise,
+    joint_range: Tensor,
+    generator: torch.Generator,
+) -> ResetDraw:
+    """Draw start frames and noise for n worlds.
+
+    Args:
+        motion: motion rows, (n,).
+        from_start: start at frame 0, (n,) bool.
+        noiseless: no noise, reference velocities, (n,) bool.
+        length: frames of each motion, (n,).
+        noise: standard deviations.
+        joint_range: (2, J, 2).
+        generator: source of randomness.
+    """
+    n, joints = len(motion), joint_range.shape[1]
+    frame = start_frames(length, generator)
+    frame = torch.where(from_start, torch.zeros_like(frame), frame)
+    draw = torch.randn(n, 2, joints, generator=generator)
+    vel = torch.randn(n, 2, joints, generator=generator)
+    span = joint_range[..., 1] - joint_range[..., 0]
+    std = noise.finger_range * span
+    std[:, :3] = noise.wrist_pos
+    std[:, 3:6] = math.radians(noise.wrist_rot_deg)
+    quiet = noiseless[:, None, None]
+    finger_vel = vel[..., 6:] * noise.finger_vel
+    return ResetDraw(
+        motion=motion,
+        frame=frame,
+        pos_noise=torch.where(quiet, 0.0, draw * std),
+        vel_noise=torch.where(quiet, 0.0, vel[..., :6] * noise.wrist_vel),
+        finger_vel=torch.where(quiet, math.nan, finger_vel),
+    )
+
+
+def reset_state(
+    draw: ResetDraw, bank: ReferenceBank, joint_range: Tensor
+) -> dict[str, Tensor]:
+    """Turn a draw into the physical state of n worlds.
+
+    Args:
+        draw: motions, frames and noise.
+        bank: reference frames.
+        joint_range: (2, J, 2); start positions are clamped to it.
+
+    Returns:
+        joint_pos, joint_vel (n, 2, J), object_pose (n, O, 7), object_vel (n, O, 6).
+    """
+    ref = bank.at(draw.motion, draw.frame)
+    pos = ref["joint_pos"] + draw.pos_noise
+    pos = torch.minimum(torch.maximum(pos, joint_range[..., 0]), joint_range[..., 1])
+    wrist = ref["joint_vel"][..., :6] + draw.vel_noise
+    kept = draw.finger_vel.isnan()
+    fingers = torch.where(kept, ref["joint_vel"][..., 6:], draw.finger_vel)
+    return {
+        "joint_pos": pos,
+        "joint_vel": torch.cat([wrist, fingers], -1),
+        "object_pose": torch.cat([ref["object_pos"], ref["object_quat"]], -1),
+        "object_vel": torch.cat([ref["object_linvel"], ref["object_angvel"]], -1),
+    }

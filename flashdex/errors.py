@@ -1,0 +1,89 @@
+"""Every error a user can meet: what, where, what is allowed, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class FlashdexError(Exception):
+    """Base of all errors caused by input; the command line turns it into exit code 2."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ``" Did you mean 'x'?"`` for the closest known name, or nothing.
+
+    Args:
+        name: the word the user wrote.
+        known: the words that would have been accepted.
+    """
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" Did you mean '{close[0]}'?" if close else ""
+
+
+class UnknownNameError(FlashdexError):
+    """A name that is not in a registry; the message lists the known ones."""
+
+    kind = "name"
+
+    def __init__(self, name: str, known: Iterable[str], *, where: str = "") -> None:
+        known = sorted(known)
+        place = f"{where}: " if where else ""
+        super().__init__(
+            f"{place}'{name}' is not a known {self.kind}. "
+            f"Known: {', '.join(known)}.{nearest(name, known)}"
+        )
+
+
+class UnknownHandError(UnknownNameError):
+    """A hand that is not built in."""
+
+    kind = "hand"
+
+
+class UnknownSourceError(UnknownNameError):
+    """A motion source (reader) that does not exist."""
+
+    kind = "motion source"
+
+
+class UnknownRecipeError(UnknownNameError):
+    """A recipe that is neither a file nor a name in the search path."""
+
+    kind = "recipe"
+
+
+class RecipeError(FlashdexError):
+    """All mistakes of a recipe at once, each with its YAML path."""
+
+    def __init__(self, problems: list[str], *, where: str = "recipe") -> None:
+        self.problems = problems
+        lines = "\n".join(f"  {i + 1}. {p}" for i, p in enumerate(problems))
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        super().__init__(f"{where}: {count}\n{lines}")
+
+
+class DemoError(FlashdexError):
+    """A recording that cannot be read or used."""
+
+
+class MeshError(FlashdexError):
+    """A mesh that is missing, empty or has no volume."""
+
+
+class LibraryError(FlashdexError):
+    """A motion library that is missing, incomplete or of another schema."""
+
+
+class RunError(FlashdexError):
+    """A run directory that is missing or incomplete."""
+
+
+class MissingExtraError(FlashdexError):
+    """An optional package that the requested feature needs."""
+
+    def __init__(self, package: str, *, extra: str) -> None:
+        super().__init__(
+            f"'{package}' is not installed. It is needed here and comes with the "
+            f"extra '{extra}': pip install 'flashdex[{extra}]'"
+        )

@@ -1,0 +1,1 @@
+"""Geometry on tensors: rotations, point sets, signed distances. Torch only."""

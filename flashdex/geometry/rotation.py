@@ -1,0 +1,288 @@
+"""Rotations as unit quaternions in wxyz order: pure functions, any leading shape.
+
+Every function keeps the dtype and device of its inputs and broadcasts leading axes.
+Angles are radians. ``q`` and ``-q`` are the same rotation; functions that return an
+angle or a rotation vector treat them alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def quat_normalize(q: Tensor) -> Tensor:
+    """Scale a quaternion to unit length.
+
+    Args:
+        q: wxyz, (..., 4), not zero.
+
+    Returns:
+        Unit quaternion, wxyz, (..., 4).
+    """
+    return q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+
+
+def quat_conj(q: Tensor) -> Tensor:
+    """Inverse of a unit quaternion: ``(w, -x, -y, -z)``.
+
+    Args:
+        q: wxyz, (..., 4).
+    """
+    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+
+
+def quat_mul(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product: rotate by ``b`` first, then by ``a``.
+
+    Args:
+        a: wxyz, (..., 4).
+        b: wxyz, (..., 4), leading axes broadcast with those of ``a``.
+
+    Returns:
+        wxyz, (..., 4).
+
+    Example:
+        >>> i = torch.tensor([0.0, 1.0, 0.0, 0.0])
+        >>> j = torch.tensor([0.0, 0.0, 1.0, 0.0])
+        >>> quat_mul(i, j)
+        tensor([0., 0., 0., 1.])
+    """
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    ax, ay, az = a.unbind(-1)
+    bx, by, bz = b.unbind(-1)
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
+
+
+def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Rotate vectors: ``v + 2 w (u x v) + 2 u x (u x v)`` with ``q = (w, u)``.
+
+    Args:
+        q: unit, wxyz, (..., 4).
+        v: vectors, (..., 3), leading axes broadcast with those of ``q``.
+
+    Returns:
+        Rotated vectors, (..., 3).
+    """
+    u = q[..., 1:]
+    t = 2 * _cross(u, v)
+    return v + q[..., :1] * t + _cross(u, t)
+
+
+def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """Rotate vectors by the inverse of ``q``: world to body.
+
+    Args:
+        q: unit, wxyz, (..., 4).
+        v: vectors, (..., 3).
+
+    Returns:
+        Rotated vectors, (..., 3).
+    """
+    return quat_rotate(quat_conj(q), v)
+
+
+def quat_to_matrix(q: Tensor) -> Tensor:
+    """Rotation matrix of a unit quaternion; column ``i`` is the turned axis ``i``.
+
+    Args:
+        q: unit, wxyz, (..., 4).
+
+    Returns:
+        Rotation matrix, (..., 3, 3).
+    """
+    w, x, y, z = q.unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quat(m: Tensor) -> Tensor:
+    """Unit quaternion of a rotation matrix, with ``w >= 0``.
+
+    Row ``k`` of ``4 q q^T`` is read from the matrix for each ``k``; the row with the
+    largest diagonal is divided by its own length, so that no angle is singular.
+
+    Args:
+        m: rotation matrix, (..., 3, 3).
+
+    Returns:
+        Unit, wxyz, (..., 4).
+    """
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (
+        row.unbind(-1) for row in m.unbind(-2)
+    )
+    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m01 + m10, m02 + m20, m12 + m21
+    ww, xx = 1 + m00 + m11 + m22, 1 + m00 - m11 - m22
+    yy, zz = 1 - m00 + m11 - m22, 1 - m00 - m11 + m22
+    outer = torch.stack(
+        (ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz), dim=-1
+    ).unflatten(-1, (4, 4))
+    best = torch.stack((ww, xx, yy, zz), dim=-1).argmax(dim=-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    q = quat_normalize(outer.gather(-2, index).squeeze(-2))
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def quat_from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
+    """Quaternion ``(cos(a/2), axis sin(a/2))``.
+
+    Args:
+        axis: unit axis, (..., 3).
+        angle: rad, (...), leading axes broadcast with those of ``axis``.
+
+    Returns:
+        Unit, wxyz, (..., 4).
+    """
+    half = 0.5 * angle[..., None]
+    xyz = axis * torch.sin(half)
+    w = torch.cos(half).expand(*xyz.shape[:-1], 1)
+    return torch.cat((w, xyz), dim=-1)
+
+
+def quat_from_rotvec(v: Tensor) -> Tensor:
+    """Exponential map: axis times angle to quaternion; smooth at zero.
+
+    Args:
+        v: rotation vector, rad, (..., 3).
+
+    Returns:
+        Unit, wxyz, (..., 4).
+    """
+    half = 0.5 * torch.linalg.vector_norm(v, dim=-1, keepdim=True)
+    # sin(h) / (2 h) through sinc, which is finite at zero with its gradient.
+    return torch.cat((torch.cos(half), 0.5 * v * torch.sinc(half / math.pi)), dim=-1)
+
+
+def quat_to_rotvec(q: Tensor) -> Tensor:
+    """Logarithm: the shortest rotation vector, of length in [0, pi].
+
+    Args:
+        q: unit, wxyz, (..., 4).
+
+    Returns:
+        Rotation vector, rad, (..., 3).
+    """
+    q = torch.where(q[..., :1] < 0, -q, q)
+    w, xyz = q[..., :1], q[..., 1:]
+    sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
+    tiny = sine < torch.finfo(q.dtype).tiny ** 0.5
+    # Below the square root of the smallest number angle / sine is 2 exactly.
+    safe = torch.where(tiny, torch.ones_like(sine), sine)
+    factor = torch.where(
+        tiny, torch.full_like(sine, 2), 2 * torch.atan2(safe, w) / safe
+    )
+    return xyz * factor
+
+
+def quat_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Geodesic angle ``2 atan2(sqrt(1 - c^2), c)`` with ``c = |<a, b>|``.
+
+    The sine is taken from the vector part of ``conj(a) b``, which equals
+    ``sqrt(1 - c^2)`` but keeps its digits when the angle is small.
+
+    Args:
+        a: unit, wxyz, (..., 4).
+        b: unit, wxyz, (..., 4).
+
+    Returns:
+        Angle in [0, pi], rad, (...).
+    """
+    delta = quat_mul(quat_conj(a), b)
+    sine = torch.linalg.vector_norm(delta[..., 1:], dim=-1)
+    return 2 * torch.atan2(sine, delta[..., 0].abs())
+
+
+def quat_slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
+    """Constant-speed way from ``a`` to ``b`` on the shorter arc.
+
+    ``a exp(t log(conj(a) b))``: exact at both ends and without a small-angle case.
+
+    Args:
+        a: unit, wxyz, (..., 4), returned at ``t = 0``.
+        b: unit, wxyz, (..., 4), reached up to sign at ``t = 1``.
+        t: share of the way, a number or (...).
+
+    Returns:
+        Unit, wxyz, (..., 4).
+    """
+    delta = quat_to_rotvec(quat_mul(quat_conj(a), b))
+    step = t[..., None] * delta if isinstance(t, Tensor) else t * delta
+    return quat_mul(a, quat_from_rotvec(step))
+
+
+def matrix_to_rot6d(m: Tensor) -> Tensor:
+    """First column, then second column, of a rotation matrix.
+
+    Args:
+        m: rotation matrix, (..., 3, 3).
+
+    Returns:
+        (..., 6).
+    """
+    return torch.cat((m[..., :, 0], m[..., :, 1]), dim=-1)
+
+
+def quat_to_rot6d(q: Tensor) -> Tensor:
+    """First column, then second column, of the rotation matrix of ``q``.
+
+    Args:
+        q: unit, wxyz, (..., 4).
+
+    Returns:
+        (..., 6).
+    """
+    return matrix_to_rot6d(quat_to_matrix(q))
+
+
+def transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
+    """Body to world: ``R p + pos``.
+
+    Args:
+        pos: body origin, world, m, (..., 3).
+        quat: body orientation, unit, wxyz, (..., 4).
+        points: in the body frame, m, (..., P, 3).
+
+    Returns:
+        Points in the world, m, (..., P, 3).
+    """
+    return points @ quat_to_matrix(quat).mT + pos[..., None, :]
+
+
+def inverse_transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
+    """World to body: ``R^T (p - pos)``.
+
+    Args:
+        pos: body origin, world, m, (..., 3).
+        quat: body orientation, unit, wxyz, (..., 4).
+        points: in the world, m, (..., P, 3).
+
+    Returns:
+        Points in the body frame, m, (..., P, 3).
+    """
+    return (points - pos[..., None, :]) @ quat_to_matrix(quat)

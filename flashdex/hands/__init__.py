@@ -1,0 +1,1 @@
+"""Robot hands: specs, MuJoCo models, kinematics."""

@@ -1,0 +1,1 @@
+"""Success criteria, continuous metrics and certificates: pure functions of tensors."""

@@ -1,0 +1,283 @@
+"""Certificate of a conversion: the stored controls, re-simulated open loop in MuJoCo C.
+
+A conversion is a claim of the training physics. The certificate replays it from the
+stored first state, as it is and under small perturbations, and says what held.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.perturbation import Perturbation, perturb
+from flashdex.metrics.resimulation import (
+    Replay,
+    Scene,
+    load_scene,
+    model_hash,
+    resimulate,
+)
+from flashdex.metrics.rollout import Rollout
+from flashdex.metrics.safety import (
+    SafetyMonitor,
+    assist_sources,
+    joint_limit_violations,
+    state_deviation,
+)
+from flashdex.metrics.verdict import CertificateVerdict, Verdict
+
+CERTIFICATE_SCHEMA = 1
+ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
+DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The proof, or its failure, as plain data.
+
+    Args:
+        verdict: ``certified`` (nominal run passes), ``robust`` (and at least 6 of 8
+            perturbed runs pass), ``failed`` or ``not_measured``.
+        reason: why not, or empty.
+        identity: schema, motion, criterion, engines and versions.
+        model: hashes, timestep, solver settings of the re-simulation.
+        inputs: sizes of the replayed sequence, stored and applied wrenches.
+        nominal: criterion -> verdict of the nominal run.
+        deviation: distance of the nominal run from the stored states.
+        perturbed: seed, sizes, runs, and per criterion the fraction that passed.
+        safety: penetration mm, force N, joint limits, warnings, NaN count.
+        provenance: seed, env steps, recipe and checkpoint hashes, hardware.
+    """
+
+    verdict: CertificateVerdict
+    reason: str
+    identity: dict[str, Any]
+    model: dict[str, Any]
+    inputs: dict[str, Any]
+    nominal: dict[str, dict[str, Any]]
+    deviation: dict[str, Any]
+    perturbed: dict[str, Any]
+    safety: dict[str, Any]
+    provenance: dict[str, Any]
+
+    def to_json(self) -> str:
+        """JSON text; numbers that are not finite become null."""
+        return json.dumps(_finite(asdict(self)), indent=1, allow_nan=False)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the JSON in one piece.
+
+        Args:
+            path: target, usually beside the rollout as ``<motion>.certificate.json``.
+        """
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        with os.fdopen(handle, "w") as file:
+            file.write(self.to_json() + "\n")
+        os.replace(temporary, path)
+        return path
+
+
+def certify(
+    rollout: Rollout,
+    *,
+    num_perturbations: int = 8,
+    seed: int = 0,
+    settings: Perturbation | None = None,
+) -> Certificate:
+    """Replay a rollout nominally and perturbed, and judge it by its own criterion.
+
+    The same file gives the same certificate on the same versions and processor type.
+
+    Args:
+        rollout: what was stored.
+        num_perturbations: k perturbed runs.
+        seed: seed of the perturbations.
+        settings: other sizes of the perturbations.
+
+    Example:
+        >>> certify(Rollout.load("rollouts/lift.npz")).verdict  # doctest: +SKIP
+        'robust'
+    """
+    settings = settings or Perturbation()
+    criterion = resolve_criterion(rollout.criterion)
+    scene = load_scene(rollout)
+    monitor = SafetyMonitor.of(scene.model, scene.object_body)
+    nominal = resimulate(scene, rollout, monitor=monitor)
+    verdicts = score(nominal.signals, grace=rollout.grace)
+    runs = []
+    for index in range(num_perturbations):
+        changed, qpos0, ctrl = perturb(
+            scene, rollout, seed=seed, index=index, settings=settings
+        )
+        run = resimulate(changed, rollout, qpos0=qpos0, ctrl=ctrl)
+        runs.append(score(run.signals, grace=rollout.grace))
+    stored_wrench = (
+        None if rollout.wrench is None else float(np.abs(rollout.wrench).max())
+    )
+    assists = assist_sources(scene.model, scene.object_body)
+    verdict, reason = _decide(
+        verdicts[criterion],
+        [run[criterion] for run in runs],
+        is_assisted=bool(assists) or (stored_wrench or nominal.wrench_max) > 0,
+    )
+    return Certificate(
+        verdict=verdict,
+        reason=reason,
+        identity=_identity(rollout, criterion),
+        model=_model_part(scene, rollout),
+        inputs={
+            "num_frames": rollout.num_frames,
+            "reference_length": rollout.reference_length,
+            "decimation": rollout.decimation,
+            "stored_wrench_max": stored_wrench,
+            "applied_wrench_max": nominal.wrench_max,
+            "assist_sources": assists,
+        },
+        nominal={name: v.to_dict() for name, v in verdicts.items()},
+        deviation=_deviation(scene, rollout, nominal),
+        perturbed=_perturbed_part(runs, seed, settings),
+        safety=_safety_part(scene, nominal, monitor),
+        provenance=_provenance(rollout),
+    )
+
+
+def _decide(
+    nominal: Verdict, runs: list[Verdict], *, is_assisted: bool
+) -> tuple[CertificateVerdict, str]:
+    if nominal.state == "not_measured":
+        return "not_measured", nominal.reason
+    if is_assisted:
+        return "failed", "assist"
+    if not nominal.is_passed:
+        return "failed", nominal.reason
+    passed = sum(run.is_passed for run in runs)
+    is_robust = bool(runs) and passed >= math.ceil(ROBUST_SHARE * len(runs))
+    return ("robust" if is_robust else "certified"), ""
+
+
+def _identity(rollout: Rollout, criterion: str) -> dict[str, Any]:
+    return {
+        "schema": CERTIFICATE_SCHEMA,
+        "motion": rollout.motion,
+        "hand": rollout.hand,
+        "criterion": criterion,
+        "grace": rollout.grace,
+        "fps": rollout.fps,
+        "produced_by": json.loads(rollout.versions),
+        "certified_by": {"engine": "mujoco", "mujoco": mujoco.__version__},
+    }
+
+
+def _model_part(scene: Scene, rollout: Rollout) -> dict[str, Any]:
+    option = scene.model.opt
+    return {
+        "xml_sha256": rollout.model_sha256,
+        "compiled_sha256": model_hash(scene.model),
+        "timestep": option.timestep,
+        "integrator": mujoco.mjtIntegrator(option.integrator).name,
+        "solver": mujoco.mjtSolver(option.solver).name,
+        "cone": mujoco.mjtCone(option.cone).name,
+        "impratio": option.impratio,
+        "iterations": option.iterations,
+        "ls_iterations": option.ls_iterations,
+        "tolerance": option.tolerance,
+    }
+
+
+def _deviation(scene: Scene, rollout: Rollout, nominal: Replay) -> dict[str, Any]:
+    shift, turn = state_deviation(scene.model, nominal.qpos, rollout.qpos)
+    # not <= : NaN counts as beyond
+    beyond = np.flatnonzero(~((shift <= DEVIATION_M) & (turn <= DEVIATION_RAD)))
+    stored = [
+        np.abs(rollout.object_pos[:, slot] - rollout.qpos[:, adr : adr + 3]).max()
+        for slot, adr in enumerate(scene.object_adr)
+        if adr >= 0
+    ]
+    return {
+        "first_frame_beyond": int(beyond[0]) if len(beyond) else -1,
+        "end_mm": float(shift[-1]) * 1e3,
+        "end_deg": math.degrees(turn[-1]),
+        "max_mm": float(shift.max()) * 1e3,
+        "max_deg": math.degrees(turn.max()),
+        # object_pos was scored in training, qpos is its state: they must be one
+        "stored_mismatch_mm": float(max(stored, default=0.0)) * 1e3,
+    }
+
+
+def _perturbed_part(
+    runs: list[dict[str, Verdict]], seed: int, settings: Perturbation
+) -> dict[str, Any]:
+    names = list(runs[0]) if runs else []
+    counts = {
+        name: {
+            state: sum(run[name].state == state for run in runs)
+            for state in ("passed", "failed", "not_measured")
+        }
+        for name in names
+    }
+    return {
+        "num_runs": len(runs),
+        "seed": seed,
+        "sizes": asdict(settings),
+        "counts": counts,
+        "pass_fraction": {
+            name: _fraction(count["passed"], count["failed"])
+            for name, count in counts.items()
+        },
+        "runs": [{name: _brief(v) for name, v in run.items()} for run in runs],
+    }
+
+
+def _fraction(passed: int, failed: int) -> float | None:
+    return passed / (passed + failed) if passed + failed else None
+
+
+def _brief(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "state": verdict.state,
+        "reason": verdict.reason,
+        "failing_frame": verdict.failing_frame,
+        "values": dict(verdict.values),
+    }
+
+
+def _safety_part(
+    scene: Scene, nominal: Replay, monitor: SafetyMonitor
+) -> dict[str, Any]:
+    return {
+        **monitor.to_dict(),
+        "joint_limits": joint_limit_violations(scene.model, nominal.qpos),
+        "warnings": nominal.warnings,
+        "nan_count": nominal.nan_count,
+    }
+
+
+def _provenance(rollout: Rollout) -> dict[str, Any]:
+    return {
+        **json.loads(rollout.provenance),
+        "seed": rollout.seed,
+        "env_steps": rollout.env_steps,
+        "certified_on": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

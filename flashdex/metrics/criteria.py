@@ -1,0 +1,194 @@
+"""Score a rollout by every named criterion (the table is in ``criteria_table``).
+
+Three states: passed, failed, not measured. What cannot be measured on a file is decided
+before what failed, so that all methods that share a motion share one denominator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from flashdex.metrics.criteria_table import (
+    Criterion,
+    Limits,
+    Term,
+    criterion_names,
+    make_criteria,
+    resolve_criterion,
+)
+from flashdex.metrics.signals import (
+    Signals,
+    centred_position_error,
+    reference_drift,
+)
+from flashdex.metrics.verdict import SIDES, Blame, Side, Verdict
+
+__all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "score"]
+
+STATIC_DRIFT = 1e-3  # m; a reference that moves less on average counts as static
+
+
+def _series(signals: Signals, term: Term, side: int, grace: int) -> Tensor | str:
+    """One hand's signal over the scored window, (T - grace,), or what is missing."""
+    source = {
+        "object_pos": ("object_pos", signals.object_pos_error),
+        "object_pos_centred": ("object_pos", signals.object_pos_offset),
+        "object_rot": ("object_quat", signals.object_rot_error),
+        "fingertip": ("fingertips", signals.fingertip_error),
+        "joint": ("joints", signals.joint_error),
+        "wrist_pos": ("wrist_pos", signals.wrist_pos_error),
+    }
+    key, value = source[term.quantity]
+    if value is None:
+        return f"missing:{signals.missing.get(key, key)}"
+    is_object = term.quantity.startswith("object")
+    window = value[grace:, signals.hand_object[side] if is_object else side]
+    if term.quantity == "object_pos_centred":
+        return centred_position_error(window)
+    return window.mean(-1) if term.quantity == "fingertip" else window
+
+
+def _reduce_time(series: Tensor, how: str) -> float:
+    if how == "max":
+        return float(series.max())
+    if how == "p95":
+        return float(torch.quantile(series, 0.95))
+    return float(series.mean())
+
+
+def _is_beyond(value: float, term: Term) -> bool:
+    return value >= term.limit if term.strict else value > term.limit
+
+
+def _object_sides(
+    signals: Signals, criterion: Criterion, sides: list[int]
+) -> list[int]:
+    """Hands whose object counts; some rules drop static references."""
+    chosen = [h for h in sides if signals.slot(h) >= 0]
+    if criterion.once_per_object and len({signals.slot(h) for h in chosen}) == 1:
+        chosen = chosen[:1]
+    if criterion.drop_static and signals.ref_object_pos is not None:
+        drift = reference_drift(signals.ref_object_pos)
+        chosen = [h for h in chosen if float(drift[signals.slot(h)]) >= STATIC_DRIFT]
+    return chosen
+
+
+def _blame(term: Term, side: Side, series: Tensor, grace: int) -> Blame:
+    beyond = (series >= term.limit) if term.strict else (series > term.limit)
+    rows = beyond.nonzero()
+    frame = int(rows[0]) + grace if len(rows) else -1
+    value = _reduce_time(series, term.time)
+    return Blame(side, term.quantity, value, term.limit, frame)
+
+
+def _unmeasurable(
+    signals: Signals, criterion: Criterion, sides: list[int], completed: bool | None
+) -> str:
+    """Why the criterion has no meaning on this file, or an empty string."""
+    if not [h for h in sides if signals.hand_active[h]]:
+        return "hand_absent"
+    if criterion.family == "completed":
+        return "missing:completed" if completed is None else ""
+    if not [h for h in sides if signals.slot(h) >= 0]:
+        return "no_object"
+    for term in criterion.terms:
+        series = _series(signals, term, 0, 0)
+        if isinstance(series, str):
+            return series
+    if not _object_sides(signals, criterion, sides):
+        return "static_reference"
+    return ""
+
+
+def _judge(
+    signals: Signals, criterion: Criterion, sides: list[int]
+) -> tuple[dict[str, float], list[Blame]]:
+    """Values that are compared with the limits, and who is beyond them."""
+    values: dict[str, float] = {}
+    blames: list[Blame] = []
+    hands = [h for h in sides if signals.hand_active[h]]
+    objects = _object_sides(signals, criterion, sides)
+    for term in criterion.terms:
+        used = objects if term.quantity.startswith("object") else hands
+        series = {h: _series(signals, term, h, criterion.grace) for h in used}
+        own = {h: _reduce_time(s, term.time) for h, s in series.items()}  # type: ignore[arg-type]
+        mean = sum(own.values()) / len(own)
+        value = max(own.values()) if term.hands == "worst" else mean
+        values[term.quantity] = value
+        if _is_beyond(value, term):
+            guilty = [h for h in used if _is_beyond(own[h], term)] or used
+            blames += [
+                _blame(term, SIDES[h], series[h], criterion.grace)  # type: ignore[arg-type]
+                for h in guilty
+            ]
+    return values, sorted(blames, key=lambda b: b.side)
+
+
+def _score_one(
+    signals: Signals,
+    criterion: Criterion,
+    name: str,
+    sides: list[int],
+    completed: bool | None,
+    partial: bool,
+) -> Verdict:
+    reason = _unmeasurable(signals, criterion, sides, completed)
+    if reason:
+        return Verdict(name, "not_measured", reason, fps=signals.fps)
+    if not signals.is_finite:
+        return Verdict(name, "failed", "numerics", fps=signals.fps)
+    if criterion.family == "completed":
+        state = "passed" if completed else "failed"
+        return Verdict(name, state, "" if completed else "terminated", fps=signals.fps)
+    is_short = signals.num_frames < signals.num_ref_frames - 1
+    if is_short and not (partial and criterion.family == "spider"):
+        return Verdict(name, "failed", "incomplete", fps=signals.fps)
+    num_scored = signals.num_frames - criterion.grace
+    if num_scored <= 0:
+        return Verdict(name, "not_measured", "no_scored_frames", fps=signals.fps)
+    values, blames = _judge(signals, criterion, sides)
+    return Verdict(
+        name,
+        "failed" if blames else "passed",
+        "limit" if blames else "",
+        values,
+        {t.quantity: t.limit for t in criterion.terms},
+        tuple(blames),
+        criterion.grace,
+        num_scored,
+        signals.fps,
+    )
+
+
+def score(
+    signals: Signals,
+    *,
+    grace: int = 15,
+    limits: Limits | None = None,
+    completed: bool | None = None,
+    partial: bool = False,
+) -> dict[str, Verdict]:
+    """Score one rollout by every criterion, for both hands together and for each hand.
+
+    Args:
+        signals: errors and masks of the rollout.
+        grace: first steps the ManipTrans family does not score.
+        limits: other limits than the published ones.
+        completed: the rollout reached the clip end under the training terminations;
+            None when they were not evaluated.
+        partial: score the SPIDER family on the available part of a short rollout.
+
+    Returns:
+        name -> verdict, in the order of :func:`criterion_names`.
+    """
+    variants: Mapping[str, list[int]] = {"": [0, 1], "_left": [0], "_right": [1]}
+    return {
+        c.name + suffix: _score_one(
+            signals, c, c.name + suffix, sides, completed, partial
+        )
+        for c in make_criteria(limits=limits, grace=grace)
+        for suffix, sides in variants.items()
+    }

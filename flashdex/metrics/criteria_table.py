@@ -1,0 +1,155 @@
+"""Every named success criterion as a row of one table.
+
+A criterion is a set of terms. A term takes one signal per hand, reduces it over the
+scored frames, then over the hands, and compares it with a limit. ``criteria.score``
+applies the rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from flashdex.errors import UnknownNameError
+
+ALIASES = {"sr_spider": "sr_spider_centred"}
+
+Quantity = Literal[
+    "object_pos", "object_pos_centred", "object_rot", "fingertip", "joint", "wrist_pos"
+]
+TimeReduction = Literal["mean", "max", "p95"]
+HandReduction = Literal["worst", "mean"]
+Family = Literal["mt", "spider", "chord", "completed"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the criteria; metres and radians."""
+
+    object_pos: float = 0.03
+    object_rot: float = math.radians(30)
+    fingertip: float = 0.06
+    joint: float = 0.08
+    loose_pos: float = 0.10
+    spider_pos: float = 0.10
+    spider_rot: float = 0.5
+    chord_wrist: float = 0.15
+    chord_pos: float = 0.10
+    chord_rot: float = 0.5
+
+
+@dataclass(frozen=True)
+class Term:
+    """One signal, its reductions over frames and hands, and its limit (m or rad)."""
+
+    quantity: Quantity
+    limit: float
+    time: TimeReduction = "mean"
+    hands: HandReduction = "worst"
+    strict: bool = False
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """A named set of terms that must all hold."""
+
+    name: str
+    terms: tuple[Term, ...]
+    family: Family
+    grace: int
+    drop_static: bool = False
+    once_per_object: bool = False
+
+
+def _maniptrans_terms(
+    limits: Limits,
+    *,
+    hand: bool,
+    scale: float = 1.0,
+    time: TimeReduction = "mean",
+    strict: bool = False,
+) -> tuple[Term, ...]:
+    objects: tuple[Quantity, ...] = ("object_pos", "object_rot")
+    tips: tuple[Quantity, ...] = ("fingertip", "joint")
+    return tuple(
+        Term(name, getattr(limits, name) * scale, time=time, strict=strict)
+        for name in (*objects, *(tips if hand else ()))
+    )
+
+
+def _maniptrans(limits: Limits, grace: int) -> Iterable[Criterion]:
+    for base, hand in (("sr_mt_obj", False), ("sr_mt", True)):
+        for suffix, scale in (("", 1.0), ("_x0.5", 0.5), ("_x2", 2.0)):
+            terms = _maniptrans_terms(limits, hand=hand, scale=scale)
+            yield Criterion(base + suffix, terms, "mt", grace)
+        terms = _maniptrans_terms(limits, hand=hand, time="max")
+        yield Criterion(f"{base}_frame", terms, "mt", grace)
+    terms = _maniptrans_terms(limits, hand=False, time="p95")
+    yield Criterion("sr_mt_obj_p95", terms, "mt", grace)
+    loose = replace(limits, object_pos=limits.loose_pos)
+    yield Criterion("sr_loose", _maniptrans_terms(loose, hand=False), "mt", grace)
+    # FlashCHORD's port: strict, whole clip, every object once
+    terms = _maniptrans_terms(limits, hand=False, strict=True)
+    yield Criterion("sr_mt_obj_flashchord", terms, "mt", 0, once_per_object=True)
+
+
+def _spider_terms(
+    limits: Limits, pos: Quantity, *, hands: HandReduction, strict: bool
+) -> tuple[Term, ...]:
+    return (
+        Term(pos, limits.spider_pos, hands=hands, strict=strict),
+        Term("object_rot", limits.spider_rot, hands=hands, strict=strict),
+    )
+
+
+def _spider(limits: Limits) -> Iterable[Criterion]:
+    centred = _spider_terms(limits, "object_pos_centred", hands="mean", strict=False)
+    raw = _spider_terms(limits, "object_pos", hands="mean", strict=True)
+    worst = _spider_terms(limits, "object_pos", hands="worst", strict=True)
+    pooled = _spider_terms(limits, "object_pos", hands="mean", strict=False)
+    yield Criterion("sr_spider_centred", centred, "spider", 0, drop_static=True)
+    yield Criterion("sr_spider_raw", raw, "spider", 0, drop_static=True)
+    yield Criterion("sr_spider_worst", worst, "spider", 0, drop_static=True)
+    # FlashCHORD's evaluator: raw, <=, static objects counted, every object once
+    yield Criterion("sr_spider_flashchord", pooled, "spider", 0, once_per_object=True)
+
+
+def make_criteria(*, limits: Limits | None = None, grace: int = 15) -> list[Criterion]:
+    """The table of criteria.
+
+    Args:
+        limits: other limits than the published ones.
+        grace: first steps the ManipTrans family does not score; the others score all.
+    """
+    limits = limits or Limits()
+    chord = (
+        Term("wrist_pos", limits.chord_wrist, time="max"),
+        Term("object_pos", limits.chord_pos, time="max"),
+        Term("object_rot", limits.chord_rot, time="max"),
+    )
+    return [
+        *_maniptrans(limits, grace),
+        *_spider(limits),
+        Criterion("completed", (), "completed", 0),
+        Criterion("chord_sr", chord, "chord", 0),
+    ]
+
+
+def criterion_names() -> list[str]:
+    """All names ``score`` returns, per-hand variants included."""
+    names = [c.name for c in make_criteria()]
+    return [n + s for n in names for s in ("", "_left", "_right")]
+
+
+def resolve_criterion(name: str) -> str:
+    """The full name of a criterion; ``sr_spider`` is FDR's name for the centred form.
+
+    Args:
+        name: a name from :func:`criterion_names` or an alias.
+    """
+    full = ALIASES.get(name, name)
+    if full not in criterion_names():
+        raise UnknownNameError(name, [*criterion_names(), *ALIASES], where="criterion")
+    return full

@@ -1,0 +1,256 @@
+"""Error signals between a rollout and its reference: the raw material of every score.
+
+Row t of a rollout is the state AFTER control step t + 1; it is compared with row t of
+the reference the step was scored on. All arithmetic is float64, so that a constant
+error has exactly that mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flashdex.geometry.rotation import quat_angle
+
+Array = Tensor | np.ndarray
+
+
+def position_error(pos: Tensor, ref_pos: Tensor) -> Tensor:
+    """Distance of origins, ``|p - p_ref|``.
+
+    Args:
+        pos: world, m, (..., 3).
+        ref_pos: world, m, (..., 3).
+
+    Returns:
+        m, (...).
+    """
+    return torch.linalg.vector_norm(pos - ref_pos, dim=-1)
+
+
+def centred_position_error(offset: Tensor) -> Tensor:
+    """``|(p - mean_t p) - (p_ref - mean_t p_ref)|``: blind to a constant offset.
+
+    Args:
+        offset: ``p - p_ref`` over the scored window, world, m, (T, ..., 3).
+
+    Returns:
+        m, (T, ...).
+    """
+    return torch.linalg.vector_norm(offset - offset.mean(0, keepdim=True), dim=-1)
+
+
+def joint_position_error(joints: Tensor, ref_joints: Tensor) -> Tensor:
+    """Half the mean over level-1 links plus half the mean over distal links.
+
+    Args:
+        joints: robot link origins, level-1 links in the first half of M and distal
+            links in the second, world, m, (..., M, 3) with M even.
+        ref_joints: human joints in the same order, world, m, (..., M, 3).
+
+    Returns:
+        m, (...).
+    """
+    distance = position_error(joints, ref_joints)
+    if distance.shape[-1] % 2:
+        raise ValueError(f"joints need an even count, got {distance.shape[-1]}")
+    level, distal = distance.chunk(2, dim=-1)
+    return 0.5 * (level.mean(-1) + distal.mean(-1))
+
+
+def reference_drift(ref_pos: Tensor) -> Tensor:
+    """``mean_t |p_ref,t - p_ref,0|``: below 1 mm a reference counts as static.
+
+    Args:
+        ref_pos: world, m, (T, ..., 3).
+
+    Returns:
+        m, (...).
+    """
+    return position_error(ref_pos, ref_pos[:1]).mean(0)
+
+
+def align_to_reference(
+    num_frames: int, num_ref: int, *, fps: float, ref_fps: float, first_step: int = 1
+) -> Tensor:
+    """Rows of a rollout that belong to the reference rows: nearest earlier sample.
+
+    Args:
+        num_frames: rows of the rollout.
+        num_ref: rows of the reference.
+        fps: rate of the rollout, Hz.
+        ref_fps: rate of the reference, Hz.
+        first_step: time of row 0 in steps of its own rate: 1 for states after a step,
+            0 for tables that start with the initial state.
+
+    Returns:
+        Row indices, (K,), K <= num_ref: reference rows the rollout has reached.
+    """
+    steps = torch.arange(first_step, num_ref + first_step, dtype=torch.float64)
+    # the small number keeps exact multiples from falling to the sample before
+    rows = torch.floor(steps * (fps / ref_fps) + 1e-9).long() - first_step
+    return rows[(rows >= 0) & (rows < num_frames)]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Errors of one rollout and the masks that say which of them count.
+
+    Args:
+        object_pos_offset: ``p - p_ref`` of the object frames, world, m, (T, O, 3).
+        object_rot_error: geodesic angle, rad, (T, O).
+        ref_object_pos: the whole reference, world, m, (T_ref, O, 3).
+        fingertip_error: robot tip to human tip, m, (T, 2, 5), or None.
+        joint_error: see :func:`joint_position_error`, m, (T, 2), or None.
+        wrist_pos_error: m, (T, 2), or None.
+        hand_active: hands [left, right] that take part.
+        hand_object: object slot of each hand, -1 without object.
+        num_frames: T, rows of the rollout.
+        num_ref_frames: T_ref, rows of the whole reference.
+        fps: control rate, Hz.
+        missing: absent signal -> key that was missing.
+        overflow: the engine dropped contacts or constraints.
+    """
+
+    object_pos_offset: Tensor | None
+    object_rot_error: Tensor | None
+    ref_object_pos: Tensor | None
+    fingertip_error: Tensor | None
+    joint_error: Tensor | None
+    wrist_pos_error: Tensor | None
+    hand_active: tuple[bool, bool]
+    hand_object: tuple[int, int]
+    num_frames: int
+    num_ref_frames: int
+    fps: float
+    missing: Mapping[str, str] = field(default_factory=dict)
+    overflow: bool = False
+
+    @property
+    def object_pos_error(self) -> Tensor | None:
+        """Norm of the offset of the object frames, m, (T, O)."""
+        if self.object_pos_offset is None:
+            return None
+        return torch.linalg.vector_norm(self.object_pos_offset, dim=-1)
+
+    def slot(self, side: int) -> int:
+        """Object slot of a hand, -1 if it has none or does not take part."""
+        return self.hand_object[side] if self.hand_active[side] else -1
+
+    @property
+    def slots(self) -> list[int]:
+        """Slots of the hands' objects; a shared object appears once per hand."""
+        return [s for s in (self.slot(0), self.slot(1)) if s >= 0]
+
+    @property
+    def is_finite(self) -> bool:
+        """No NaN or infinity in anything that counts, and no engine overflow."""
+        hands = [h for h in range(2) if self.hand_active[h]]
+        parts = [
+            x[:, rows]
+            for x, rows in (
+                (self.object_pos_offset, self.slots),
+                (self.object_rot_error, self.slots),
+                (self.fingertip_error, hands),
+                (self.joint_error, hands),
+                (self.wrist_pos_error, hands),
+            )
+            if x is not None
+        ]
+        return not self.overflow and all(bool(torch.isfinite(p).all()) for p in parts)
+
+
+def _pair(
+    data: Mapping[str, Array | None], key: str, rows: Sequence[int]
+) -> tuple[Tensor, Tensor] | str:
+    """A signal's simulated and reference array, or the key that is not usable."""
+    pair = []
+    for name in (key, f"ref_{key}"):
+        value = data.get(name)
+        if value is None or 0 in value.shape:
+            return name
+        pair.append(torch.as_tensor(value, dtype=torch.float64))
+    sim, ref = pair
+    # a hole in the reference is a fault of the file, not of the policy
+    if not bool(torch.isfinite(ref[:, list(rows)]).all()):
+        return f"ref_{key}"
+    length = min(len(sim), len(ref))
+    return sim[:length], ref[:length]
+
+
+def _error(
+    found: Mapping[str, tuple[Tensor, Tensor]],
+    key: str,
+    distance: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor | None:
+    return distance(*found[key]) if key in found else None
+
+
+def compute_signals(
+    data: Mapping[str, Array | None],
+    *,
+    hand_active: Sequence[bool],
+    hand_object: Sequence[int],
+    fps: float = 60.0,
+    num_ref_frames: int | None = None,
+    overflow: bool = False,
+) -> Signals:
+    """Errors of one rollout against its reference, as :class:`Signals` defines them.
+
+    Args:
+        data: ``object_pos`` (T, O, 3), ``object_quat`` (T, O, 4) wxyz, ``fingertips``
+            (T, 2, 5, 3), ``joints`` (T, 2, M, 3), ``wrist_pos`` (T, 2, 3), each with
+            its ``ref_`` twin; world, m. What is absent makes its signal None.
+        hand_active: hands [left, right] that take part.
+        hand_object: object slot of each hand, -1 without object.
+        fps: control rate, Hz.
+        num_ref_frames: length of the reference; default: rows of ``ref_object_pos``.
+        overflow: the engine dropped contacts or constraints.
+
+    Example:
+        >>> pose = {
+        ...     "object_pos": torch.zeros(9, 1, 3),
+        ...     "object_quat": torch.tensor([1.0, 0, 0, 0]).expand(9, 1, 4),
+        ... }
+        >>> data = pose | {f"ref_{k}": v for k, v in pose.items()}
+        >>> compute_signals(
+        ...     data, hand_active=(False, True), hand_object=(-1, 0)
+        ... ).object_rot_error.max()
+        tensor(0., dtype=torch.float64)
+    """
+    active = (bool(hand_active[0]), bool(hand_active[1]))
+    slots = (int(hand_object[0]), int(hand_object[1]))
+    hands = [h for h in range(2) if active[h]]
+    used = sorted({slots[h] for h in hands if slots[h] >= 0})
+    rows = {"object_pos": used, "object_quat": used}
+    keys = ("object_pos", "object_quat", "fingertips", "joints", "wrist_pos")
+    pairs = {key: _pair(data, key, rows.get(key, hands)) for key in keys}
+    missing = {key: value for key, value in pairs.items() if isinstance(value, str)}
+    found = {key: value for key, value in pairs.items() if not isinstance(value, str)}
+    pos = found.get("object_pos")
+    lengths = {len(sim) for sim, _ in found.values()} or {0}
+    if len(lengths) > 1:
+        raise ValueError(f"signals of different length: {sorted(lengths)}")
+    total = data.get("ref_object_pos")
+    num_frames = lengths.pop()
+    default_ref = num_frames if total is None else len(total)
+
+    return Signals(
+        object_pos_offset=None if pos is None else pos[0] - pos[1],
+        object_rot_error=_error(found, "object_quat", quat_angle),
+        ref_object_pos=None if pos is None else torch.as_tensor(total).double(),
+        fingertip_error=_error(found, "fingertips", position_error),
+        joint_error=_error(found, "joints", joint_position_error),
+        wrist_pos_error=_error(found, "wrist_pos", position_error),
+        hand_active=active,
+        hand_object=slots,
+        num_frames=num_frames,
+        num_ref_frames=default_ref if num_ref_frames is None else num_ref_frames,
+        fps=fps,
+        missing=missing,
+        overflow=overflow,
+    )

@@ -1,0 +1,1 @@
+"""Networks, exploration and policy of FlashSAC; they know no environment."""

@@ -1,0 +1,121 @@
+"""The first layer: BatchNorm of the raw input, folded into a unit-row linear map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from flashdex.modules.layers import Mode, UnitBatchNorm, UnitLinear
+
+
+class InputEmbed(nn.Module):
+    """``UnitLinear(UnitBatchNorm([part_1, part_2, ...]))`` without an (E, B, D) tensor.
+
+    Members usually see the same wide observation. Its statistics are then the same for
+    all of them, so the input is normalised once, (B, D), and the affine part of each
+    member moves into that member's weights:
+    ``W (gamma x + beta) = (W gamma) x + W beta``.
+
+    Args:
+        in_features: total width D of all parts.
+        width: output width.
+        ensemble: number of members E.
+        column_mask: optional (E, D) of 0 and 1; a member never sees its zero columns.
+    """
+
+    column_mask: Tensor | None
+
+    def __init__(
+        self,
+        in_features: int,
+        width: int,
+        *,
+        ensemble: int = 1,
+        column_mask: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.norm = UnitBatchNorm(in_features, ensemble=ensemble)
+        self.linear = UnitLinear(in_features, width, ensemble=ensemble)
+        self.register_buffer("column_mask", column_mask, persistent=False)
+        if column_mask is not None:
+            with torch.no_grad():
+                self.linear.weight.mul_(column_mask[:, None])
+            self.linear.project_()
+
+    def forward(self, parts: Sequence[Tensor], *, mode: Mode) -> Tensor:
+        """Embed the concatenation of ``parts``.
+
+        Args:
+            parts: tensors (B, d) seen by all members or (E, B, d), one view a member;
+                in the order of the input columns.
+            mode: see `flashdex.modules.layers.Mode`.
+
+        Returns:
+            (E, B, width).
+        """
+        if mode == "train":
+            centred, scale, shift = self._batch_normalise(parts)
+        else:
+            centred, scale, shift = self._running_normalise(parts, mode)
+        weight = self.linear.parameter(mode)
+        if self.column_mask is not None:
+            scale, shift = scale * self.column_mask, shift * self.column_mask
+        bias = torch.bmm(weight, shift.unsqueeze(-1)).squeeze(-1)
+        folded = (weight * scale[:, None]).split([p.shape[-1] for p in parts], -1)
+        return _sum_of_products(centred, folded, bias)
+
+    def _batch_normalise(
+        self, parts: Sequence[Tensor]
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        gamma, beta = self.norm.affine("train")
+        means = [p.mean(-2, keepdim=True) for p in parts]
+        centred = [p - m for p, m in zip(parts, means, strict=True)]
+        variances = [c.square().mean(-2, keepdim=True) for c in centred]
+        mean, var = _concatenate(means), _concatenate(variances)
+        self.norm.track_(mean, var, parts[0].shape[-2])
+        return centred, gamma * torch.rsqrt(var + self.norm.eps), beta
+
+    def _running_normalise(
+        self, parts: Sequence[Tensor], mode: Mode
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        gamma, beta = self.norm.affine(mode)
+        scale = gamma * torch.rsqrt(self.norm.running_var + self.norm.eps)
+        # Any common centre is exact; member 0's mean keeps the products small, so that
+        # a feature with a large offset does not lose digits in float32.
+        centre = self.norm.running_mean[0]
+        shift = beta - scale * (self.norm.running_mean - centre)
+        centres = centre.split([p.shape[-1] for p in parts])
+        return [p - c for p, c in zip(parts, centres, strict=True)], scale, shift
+
+
+def _concatenate(rows: Sequence[Tensor]) -> Tensor:
+    """Rows (1, d) or (E, 1, d) side by side: (1, D), or (E, D) if a member differs."""
+    members = max(row.shape[0] for row in rows)
+    flat = [row.reshape(-1, row.shape[-1]) for row in rows]
+    return torch.cat([row.expand(members, -1) for row in flat], dim=-1)
+
+
+def _sum_of_products(
+    parts: Sequence[Tensor], weights: Sequence[Tensor], bias: Tensor
+) -> Tensor:
+    """``sum_i parts_i weights_i^T + bias``: one wide product per shared part."""
+    ensemble, width = bias.shape
+    shared: Tensor | None = None
+    for part, weight in zip(parts, weights, strict=True):
+        if part.dim() == 2:
+            flat = weight.reshape(ensemble * width, -1)
+            shared = (
+                linear(part, flat, bias.reshape(-1))
+                if shared is None
+                else torch.addmm(shared, part, flat.mT)
+            )
+    out = bias[:, None]
+    if shared is not None:
+        out = shared.unflatten(-1, (ensemble, width)).transpose(0, 1)
+    for part, weight in zip(parts, weights, strict=True):
+        if part.dim() == 3:
+            out = torch.baddbmm(out, part, weight.mT)
+    return out

@@ -1,0 +1,88 @@
+"""The future encoder: a window of coming reference frames as one latent vector."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear, silu
+
+from flashdex.modules.layers import Mode
+
+KERNELS = (1, 4, 2)
+STRIDES = (1, 2, 1)
+
+
+class FutureEncoder(nn.Module):
+    """Three temporal convolutions with SiLU and a linear read-out, for E members.
+
+    1x1 to 128, kernel 4 stride 2 to 64, kernel 2 to 32, flatten, linear to the latent:
+    59,488 parameters with 78 channels, 10 frames and latent 128. Ordinary layers with
+    bias; neither normalised nor projected.
+
+    Args:
+        channels: features C of one frame.
+        num_frames: frames K of the window, at least 6.
+        latent_dim: size of the output.
+        widths: output channels of the three convolutions.
+        ensemble: number of members E; all see the same window.
+
+    Example:
+        >>> encoder = FutureEncoder(78)
+        >>> encoder(torch.randn(4, 78, 10)).shape
+        torch.Size([1, 4, 128])
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        *,
+        num_frames: int = 10,
+        latent_dim: int = 128,
+        widths: tuple[int, int, int] = (128, 64, 32),
+        ensemble: int = 1,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = latent_dim
+        self.ensemble = ensemble
+        sizes, length = [], num_frames
+        fan_channels = channels
+        for width, kernel, stride in zip(widths, KERNELS, STRIDES, strict=True):
+            sizes.append((fan_channels * kernel, width))
+            fan_channels, length = width, (length - kernel) // stride + 1
+        sizes.append((fan_channels * length, latent_dim))
+        self.weights = nn.ParameterList(
+            torch.empty(ensemble, out, fan_in) for fan_in, out in sizes
+        )
+        self.biases = nn.ParameterList(torch.empty(ensemble, out) for _, out in sizes)
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draw weights and biases from U(-1, 1) / sqrt(fan_in)."""
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            bound = 1.0 / math.sqrt(weight.shape[-1])
+            weight.uniform_(-bound, bound)
+            bias.uniform_(-bound, bound)
+
+    def forward(self, future: Tensor, *, mode: Mode = "train") -> Tensor:
+        """Encode ``future`` (B, C, K) to (E, B, latent_dim)."""
+        weights, biases = list(self.weights), list(self.biases)
+        if mode == "frozen":
+            weights, biases = (
+                [w.detach() for w in weights],
+                [b.detach() for b in biases],
+            )
+        batch = future.shape[0]
+        # frames before channels: each convolution is one product over its window
+        x = linear(future.mT, weights[0].flatten(0, 1), biases[0].flatten())
+        x = silu(x).unflatten(-1, (self.ensemble, -1)).movedim(2, 0)
+        for i in (1, 2):
+            windows = x.unfold(2, KERNELS[i], STRIDES[i])
+            length = windows.shape[2]
+            flat = windows.reshape(self.ensemble, batch * length, -1)
+            x = silu(torch.baddbmm(biases[i][:, None], flat, weights[i].mT))
+            x = x.unflatten(1, (batch, length))
+        flat = x.flatten(2)
+        return torch.baddbmm(biases[3][:, None], flat, weights[3].mT)

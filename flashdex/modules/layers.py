@@ -1,0 +1,195 @@
+"""Primitive layers of FlashSAC: unit rows, joint-norm BatchNorm, RMSNorm.
+
+Every weight carries a leading ensemble axis E, so that twin critics and the towers of
+several groups run as one batched product. The normalisation mode is an argument of each
+call and never hidden state: one network runs in different modes within one update.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from flashdex.modules.batchnorm import batch_norm_relu
+
+Mode = Literal["train", "eval", "frozen"]
+"""How a forward pass treats statistics and parameters.
+
+``train``: batch statistics, running statistics move. ``eval``: running statistics.
+``frozen``: as ``eval`` with detached parameters; only inputs receive gradients.
+"""
+
+NORM_EPS = 1e-8
+
+
+class UnitLinear(nn.Module):
+    """Linear map without bias whose rows have unit length after each projection.
+
+    ``y = x W^T`` per ensemble member (FlashSAC, table of primitive layers).
+
+    Args:
+        in_features: size of the input.
+        out_features: size of the output.
+        ensemble: number of members E.
+
+    Example:
+        >>> layer = UnitLinear(3, 5, ensemble=2)
+        >>> layer(torch.randn(2, 7, 3)).shape
+        torch.Size([2, 7, 5])
+    """
+
+    def __init__(
+        self, in_features: int, out_features: int, *, ensemble: int = 1
+    ) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(ensemble, out_features, in_features))
+        for member in self.weight.detach():
+            nn.init.orthogonal_(member)
+        # orthogonal rows are not unit rows when out_features > in_features
+        self.project_()
+
+    def parameter(self, mode: Mode) -> Tensor:
+        """The weight (E, out_features, in_features); detached when frozen."""
+        return self.weight.detach() if mode == "frozen" else self.weight
+
+    def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
+        """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
+        return torch.bmm(x, self.parameter(mode).mT)
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Scale every row to length one, in place."""
+        norm = torch.linalg.vector_norm(self.weight, dim=-1, keepdim=True)
+        self.weight.div_(norm.clamp_min_(NORM_EPS))
+
+
+def dense_relu(
+    linear: UnitLinear,
+    norm: UnitBatchNorm,
+    x: Tensor,
+    *,
+    mode: Mode,
+    keep: slice | None = None,
+) -> Tensor:
+    """``relu(norm(linear(x)))`` for E members.
+
+    With running statistics the normalisation is affine and moves into the weights.
+
+    Args:
+        linear: linear map without bias.
+        norm: BatchNorm of its output.
+        x: input, (E, B, in_features).
+        mode: see `Mode`.
+        keep: rows of the batch to return; all rows enter the batch statistics.
+
+    Returns:
+        (E, rows, out_features).
+    """
+    if mode == "train":
+        y = linear(x)
+        gamma, beta = norm.affine(mode)
+        out, mean, var = batch_norm_relu(y, gamma, beta, eps=norm.eps, keep=keep)
+        norm.track_(mean, var, x.shape[1])
+        return out
+    scale, shift = norm.running_affine(mode)
+    weight = linear.parameter(mode) * scale.unsqueeze(-1)
+    x = x if keep is None else x[:, keep]
+    return torch.baddbmm(shift[:, None], x, weight.mT).relu_()
+
+
+class UnitBatchNorm(nn.Module):
+    """BatchNorm over the batch axis; the joint norm of [gamma; beta] is sqrt(d).
+
+    Normalises with the biased batch variance and tracks the unbiased one, momentum
+    0.01, eps 1e-5. Statistics are kept per ensemble member. The layer holds state and
+    projection; `dense_relu` and `InputEmbed` apply it fused with their products.
+
+    Args:
+        features: size d of the last axis.
+        ensemble: number of members E.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        *,
+        ensemble: int = 1,
+        momentum: float = 0.01,
+        eps: float = 1e-5,
+    ) -> None:
+        super().__init__()
+        self.momentum = momentum
+        self.eps = eps
+        self.weight = nn.Parameter(torch.ones(ensemble, features))
+        self.bias = nn.Parameter(torch.zeros(ensemble, features))
+        self.register_buffer("running_mean", torch.zeros(ensemble, features))
+        self.register_buffer("running_var", torch.ones(ensemble, features))
+
+    def affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
+        """Gamma and beta, (E, d) each; without gradient when ``mode`` is frozen."""
+        if mode == "frozen":
+            return self.weight.detach(), self.bias.detach()
+        return self.weight, self.bias
+
+    @torch.no_grad()
+    def track_(self, mean: Tensor, var: Tensor, count: int) -> None:
+        """Move the running statistics towards biased batch statistics, in place.
+
+        Args:
+            mean: batch mean, (E, d) or (d,).
+            var: biased batch variance, (E, d) or (d,).
+            count: rows of the batch.
+        """
+        unbiased = var.detach() * (count / max(count - 1, 1))
+        mean = mean.detach().expand_as(self.running_mean)
+        self.running_mean.lerp_(mean, self.momentum)
+        self.running_var.lerp_(unbiased.expand_as(self.running_var), self.momentum)
+
+    def running_affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
+        """``scale, shift`` (E, d) of the running form ``y = scale x + shift``."""
+        gamma, beta = self.affine(mode)
+        scale = gamma * torch.rsqrt(self.running_var + self.eps)
+        return scale, torch.addcmul(beta, scale, self.running_mean, value=-1)
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Scale gamma and beta together so that their joint norm is sqrt(d)."""
+        square = self.weight.square().sum(-1, True) + self.bias.square().sum(-1, True)
+        scale = self.weight.shape[-1] ** 0.5 * torch.rsqrt(square + NORM_EPS)
+        self.weight.mul_(scale)
+        self.bias.mul_(scale)
+
+
+class UnitRMSNorm(nn.Module):
+    """``x rsqrt(mean(x^2) + 1e-6) g`` over the last axis, norm of g is sqrt(d).
+
+    Args:
+        features: size d of the last axis.
+        ensemble: number of members E.
+    """
+
+    def __init__(self, features: int, *, ensemble: int = 1, eps: float = 1e-6) -> None:
+        super().__init__()
+        self.eps = eps
+        self.weight = nn.Parameter(torch.ones(ensemble, features))
+
+    def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
+        """Normalise ``x`` (E, B, d) over its last axis."""
+        weight = self.weight.detach() if mode == "frozen" else self.weight
+        scale = torch.rsqrt(x.square().mean(-1, keepdim=True) + self.eps)
+        return x * scale * weight[:, None]
+
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Scale g to norm sqrt(d), in place."""
+        square = self.weight.square().sum(-1, keepdim=True)
+        self.weight.mul_(self.weight.shape[-1] ** 0.5 * torch.rsqrt(square + NORM_EPS))
+
+
+def project_(module: nn.Module) -> None:
+    """Project every unit-norm layer inside ``module``, in place."""
+    for layer in module.modules():
+        if isinstance(layer, UnitLinear | UnitBatchNorm | UnitRMSNorm):
+            layer.project_()

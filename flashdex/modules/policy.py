@@ -1,0 +1,59 @@
+"""The actor as a TensorDict policy with held exploration noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from flashdex.modules.actor import FlashActor
+from flashdex.modules.exploration import NoiseRepetition
+
+
+class FlashPolicy(TensorDictModuleBase):
+    """Writes one action a group: stochastic under RANDOM, ``tanh(mean)`` otherwise.
+
+    BatchNorm runs on running statistics; evaluation leaves the noise clocks alone.
+
+    Args:
+        actor: towers of all groups.
+        groups: group names, one a tower; None writes a single root ``action``.
+        noise: held noise.
+        observation: key of the observation, (N, D).
+        future: key of the future window, (N, C, K), read if the actor has an encoder.
+        action: name of the action inside its group.
+    """
+
+    def __init__(
+        self,
+        actor: FlashActor,
+        *,
+        groups: Sequence[str] | None = None,
+        noise: NoiseRepetition | None = None,
+        observation: NestedKey = "observation",
+        future: NestedKey = "future",
+        action: str = "action",
+    ) -> None:
+        super().__init__()
+        self.actor = actor
+        self.noise = NoiseRepetition() if noise is None else noise
+        self.has_future = actor.future_encoder is not None
+        self.in_keys = [observation, future] if self.has_future else [observation]
+        self.out_keys = [action] if groups is None else [(g, action) for g in groups]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Set the action of every group; any batch shape."""
+        batch = tensordict.batch_size
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        inputs = [x.reshape(-1, *x.shape[len(batch) :]) for x in inputs]
+        mean, std = self.actor(*inputs, mode="eval")
+        if exploration_type() == ExplorationType.RANDOM:
+            mean = mean + std * self.noise(tuple(mean.shape)).to(mean.dtype)
+        action = torch.tanh(mean)
+        for key, value in zip(self.out_keys, action.unbind(0), strict=True):
+            tensordict.set(key, value.reshape(*batch, -1))
+        return tensordict

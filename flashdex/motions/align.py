@@ -1,0 +1,161 @@
+"""A demonstration on the library's terms: z up, table at z = 0, at the control rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from flashdex.errors import DemoError
+from flashdex.motions.contacts import NO_OBJECT, assign_object, contact_runs, tip_distances
+from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
+from flashdex.motions.library import NUM_OBJECT_SLOTS
+from flashdex.motions.meshes import load_mesh
+from flashdex.motions.support import estimate_support
+from flashdex.motions.tracks import (
+    continuous,
+    resample,
+    resample_pose,
+    sample_times,
+    transform_pose,
+)
+
+# turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
+UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
+
+
+@dataclass
+class AlignedDemo:
+    """Tracks of one motion at the control rate, [left, right]; absent hands are zero.
+
+    Args:
+        name: of the motion.
+        fps: control rate.
+        keypoints: m, (T, 2, 21, 3).
+        palm: (T, 2, 7).
+        present: hands that were recorded, (2,).
+        active: hands that touch an object, (2,).
+        hand_object: slot of each hand's object, -1 for none, (2,).
+        tip_dist: to the surface of that object, m, (T, 2, 5).
+        contact: fingers in contact, (T, 2, 5) bool.
+        poses: per slot (T, 7).
+        meshes: per slot.
+        object_names: per slot.
+        support_z: height of the table in the recording, m.
+        support_found: whether it comes from rest or the reader, not from a guess.
+    """
+
+    name: str
+    fps: float
+    keypoints: np.ndarray
+    palm: np.ndarray
+    present: np.ndarray
+    active: np.ndarray
+    hand_object: np.ndarray
+    tip_dist: np.ndarray
+    contact: np.ndarray
+    poses: list[np.ndarray]
+    meshes: list[trimesh.Trimesh]
+    object_names: list[str]
+    support_z: float
+    support_found: bool
+
+    @property
+    def num_frames(self) -> int:
+        """Frames at the control rate."""
+        return len(self.keypoints)
+
+
+def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
+    """Turn up, shift the table to z = 0, resample, and find out who touches what.
+
+    Args:
+        demo: validated.
+        control_hz: frames a second of the result.
+    """
+    meshes = [_mesh(body) for body in demo.objects]
+    turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
+    poses = [transform_pose(b.pose, turn) for b in demo.objects]
+    height, found = demo.support_z, True
+    if height is None:
+        vertices = [np.asarray(m.vertices) for m in meshes]
+        height, found = estimate_support(poses, vertices, demo.fps)
+    times = sample_times(demo.num_frames, demo.fps, control_hz)
+    lift = np.array([0.0, 0.0, -height])
+    poses = [resample_pose(p, demo.fps, times) for p in poses]
+    for pose in poses:
+        pose[:, :3] += lift
+    keypoints, palm = _hands(demo, turn, times, lift)
+    present = np.array([side in demo.keypoints for side in SIDES])
+    slots, used, tip_dist = _assign(demo, keypoints, present, poses, meshes)
+    contact = np.stack([contact_runs(tip_dist[:, h], control_hz) for h in range(2)], 1)
+    return AlignedDemo(
+        name=demo.name,
+        fps=control_hz,
+        keypoints=keypoints,
+        palm=palm,
+        present=present,
+        active=present & contact.any(axis=(0, 2)),
+        hand_object=used,
+        tip_dist=tip_dist,
+        contact=contact,
+        poses=[poses[i] for i in slots],
+        meshes=[meshes[i] for i in slots],
+        object_names=[demo.objects[i].name for i in slots],
+        support_z=float(height),
+        support_found=found,
+    )
+
+
+def _mesh(body: DemoObject) -> trimesh.Trimesh:
+    if isinstance(body.mesh, trimesh.Trimesh):
+        return body.mesh
+    return load_mesh(Path(body.mesh))
+
+
+def _hands(
+    demo: HumanDemo, turn: Rotation, times: np.ndarray, lift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    keypoints = np.zeros((len(times), 2, 21, 3))
+    palm = np.zeros((len(times), 2, 7))
+    palm[..., 3] = 1.0
+    for hand, side in enumerate(SIDES):
+        if side not in demo.keypoints:
+            continue
+        points = demo.keypoints[side]
+        points = turn.apply(points.reshape(-1, 3)).reshape(points.shape)
+        keypoints[:, hand] = resample(points, demo.fps, times) + lift
+        pose = transform_pose(demo.palm[side], turn)
+        palm[:, hand] = resample_pose(pose, demo.fps, times)
+        palm[:, hand, :3] += lift
+        palm[:, hand, 3:] = continuous(palm[:, hand, 3:])
+    return keypoints, palm
+
+
+def _assign(
+    demo: HumanDemo,
+    keypoints: np.ndarray,
+    present: np.ndarray,
+    poses: list[np.ndarray],
+    meshes: list[trimesh.Trimesh],
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Objects kept (rows of the demo), slot of each hand, and its tip distances."""
+    chosen: dict[int, int] = {}
+    tip_dist = np.full((len(keypoints), 2, 5), NO_OBJECT)
+    for hand in np.flatnonzero(present):
+        side = SIDES[hand]
+        fixed = [demo.hand_object[side]] if side in demo.hand_object else range(len(poses))
+        near = [tip_distances(keypoints[:, hand], poses[i], meshes[i]) for i in fixed]
+        best = assign_object(near)
+        chosen[int(hand)] = fixed[best]
+        tip_dist[:, hand] = near[best]
+    slots = sorted(set(chosen.values()))
+    slots += [i for i in range(len(poses)) if i not in slots]
+    slots = slots[:NUM_OBJECT_SLOTS]
+    if not slots:
+        raise DemoError(f"{demo.name}: no object is near a hand.")
+    used = np.array([slots.index(chosen[h]) if h in chosen else -1 for h in range(2)])
+    return slots, used, tip_dist

@@ -1,0 +1,142 @@
+"""Convex parts of a mesh for collision, and its mass properties."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from flashdex.geometry.points import farthest_point_sampling
+
+logger = logging.getLogger(__name__)
+
+CONVEX_TOLERANCE = 0.01  # a mesh this close to its hull's volume is its own part
+MIN_PART_VOLUME = 1e-5  # share of the hull; slivers below it only slow contacts down
+INERTIA_SLACK = 1e-6  # of the largest moment, added to all three
+
+
+def compute_convex_parts(
+    mesh: trimesh.Trimesh,
+    *,
+    max_parts: int,
+    threshold: float,
+    max_vertices: int,
+    seed: int,
+    name: str,
+) -> list[NDArray[np.float32]]:
+    """Cover a mesh with convex hulls by CoACD.
+
+    A mesh whose volume is within 1 % of its hull's is its own single part.
+
+    Args:
+        mesh: cleaned triangles, m.
+        max_parts: most parts.
+        threshold: concavity that CoACD leaves in a part.
+        max_vertices: most vertices a part.
+        seed: of CoACD's search.
+        name: file or object, for messages.
+
+    Returns:
+        Vertices of each hull in the object frame, m, float32, each (V, 3), largest
+        volume first.
+    """
+    whole = mesh.convex_hull
+    convex = mesh.is_volume and mesh.volume > (1 - CONVEX_TOLERANCE) * whole.volume
+    found = []
+    if not convex and max_parts > 1:
+        found = _run_coacd(
+            mesh, max_parts=max_parts, threshold=threshold, seed=seed, name=name
+        )
+    hulls = []
+    for vertices in found:
+        try:
+            hull = ConvexHull(vertices)
+        except QhullError:
+            continue
+        if hull.volume > MIN_PART_VOLUME * whole.volume:
+            hulls.append((hull.volume, vertices[hull.vertices]))
+    if not hulls:
+        hulls = [(whole.volume, np.asarray(whole.vertices))]
+    hulls.sort(key=lambda item: -item[0])
+    return [np.float32(_reduce_hull(v, max_vertices)) for _, v in hulls]
+
+
+def _run_coacd(
+    mesh: trimesh.Trimesh, *, max_parts: int, threshold: float, seed: int, name: str
+) -> list[NDArray[np.float64]]:
+    import coacd  # loads a native library; only needed when nothing is cached
+
+    coacd.set_log_level("off")
+    try:
+        parts = coacd.run_coacd(
+            coacd.Mesh(mesh.vertices, mesh.faces),
+            threshold=threshold,
+            max_convex_hull=max_parts,
+            seed=seed,
+        )
+    except (RuntimeError, OSError) as error:
+        logger.warning("%s: CoACD failed (%s); one convex hull instead", name, error)
+        return []
+    if len(parts) > max_parts:
+        logger.warning("%s: more than %d parts; one convex hull", name, max_parts)
+        return []
+    return [vertices for vertices, _ in parts]
+
+
+def _reduce_hull(
+    vertices: NDArray[np.float64], max_vertices: int
+) -> NDArray[np.float64]:
+    if len(vertices) <= max_vertices:
+        return vertices
+    order = farthest_point_sampling(torch.from_numpy(vertices), max_vertices)
+    kept = vertices[order.numpy()]
+    # Fewer corners lie inside the hull; growing about the mean keeps its volume.
+    growth = (ConvexHull(vertices).volume / ConvexHull(kept).volume) ** (1 / 3)
+    centre = kept.mean(axis=0)
+    return centre + growth * (kept - centre)
+
+
+def compute_mass_properties(
+    mesh: trimesh.Trimesh,
+    parts: list[NDArray[np.float32]],
+    *,
+    density: float,
+    mass_limits: tuple[float, float],
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Mass, centre of mass and inertia of a homogeneous solid.
+
+    The solid is the mesh where it bounds a volume, else the sum of its convex parts.
+    ``inertia = mass / volume * (integral of |r|^2 1 - r r^T over the solid)``.
+
+    Args:
+        mesh: cleaned triangles, m.
+        parts: hull vertices, m, each (V, 3).
+        density: kg/m^3.
+        mass_limits: smallest and largest mass, kg.
+
+    Returns:
+        Mass, kg; centre of mass in the object frame, m, (3,); inertia about the centre
+        of mass in object axes, kg m^2, (3, 3), positive definite with every moment
+        below the sum of the other two.
+    """
+    solids = (
+        [mesh] if mesh.is_volume else [trimesh.convex.convex_hull(p) for p in parts]
+    )
+    volumes = np.array([s.volume for s in solids])
+    centres = np.array([s.center_mass for s in solids])
+    volume = float(volumes.sum())
+    com = volumes @ centres / volume
+    second = np.zeros((3, 3))
+    for solid, part_volume, centre in zip(solids, volumes, centres, strict=True):
+        arm = centre - com
+        second += solid.moment_inertia / solid.density
+        second += part_volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    mass = float(np.clip(density * volume, *mass_limits))
+    inertia = mass / volume * 0.5 * (second + second.T)
+    # The same amount on all three moments keeps a + b > c and lifts rounding errors.
+    slack = INERTIA_SLACK * float(np.linalg.eigvalsh(inertia)[-1])
+    return mass, com, inertia + slack * np.eye(3)

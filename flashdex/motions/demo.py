@@ -1,0 +1,181 @@
+"""A human demonstration: what a recording must hold before it can be prepared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+
+from flashdex.errors import DemoError
+
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+TIP_KEYPOINTS = (4, 8, 12, 16, 20)
+NUM_KEYPOINTS = 21
+MIN_FRAMES = 10
+MIN_SECONDS = 0.5
+QUAT_TOLERANCE = 1e-2
+
+
+@dataclass
+class DemoObject:
+    """One rigid object of a demonstration.
+
+    Args:
+        name: unique within a library together with the mesh's content.
+        mesh: a mesh file, or the mesh itself, metres, in the frame of ``pose``.
+        pose: position (m) and quaternion (wxyz) in the world, (T, 7).
+    """
+
+    name: str
+    mesh: Path | trimesh.Trimesh
+    pose: np.ndarray
+
+
+@dataclass
+class HumanDemo:
+    """One recorded human motion, before any processing; numpy float64.
+
+    Args:
+        name: unique in its collection; also the file name of what is made from it.
+        fps: frames a second of every track.
+        keypoints: per recorded hand (T, 21, 3), m, world; 0 wrist, then four a finger
+            from the thumb to the pinky.
+        palm: per recorded hand (T, 7): wrist position (m) and quaternion (wxyz) of the
+            palm frame: x to the middle MCP, z out of the palm.
+        objects: the objects of the scene.
+        hand_object: which object (its place in ``objects``) a hand uses; a hand that
+            is missing here is assigned by contact.
+        source: the reader's name.
+        licence: of the recording.
+        up: which axis of the recording's world points up.
+        support_z: height of the table in the recording's world, m, if known.
+    """
+
+    name: str
+    fps: float
+    keypoints: dict[Side, np.ndarray]
+    palm: dict[Side, np.ndarray]
+    objects: list[DemoObject]
+    hand_object: dict[Side, int] = field(default_factory=dict)
+    source: str = ""
+    licence: str = ""
+    up: Literal["z", "y", "-y"] = "z"
+    support_z: float | None = None
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of the first object's track."""
+        return len(self.objects[0].pose) if self.objects else 0
+
+    @property
+    def seconds(self) -> float:
+        """Duration, s."""
+        return self.num_frames / self.fps
+
+    def validate(self) -> None:
+        """Refuse a recording that cannot be used.
+
+        Raises:
+            DemoError: names the motion, the track and the first frame at fault.
+        """
+        if not self.keypoints:
+            raise DemoError(f"{self.name}: no hand. Give keypoints for 'left', 'right'.")
+        if not self.objects:
+            raise DemoError(f"{self.name}: no object. Give a mesh and its poses.")
+        if not np.isfinite(self.fps) or self.fps <= 0:
+            raise DemoError(f"{self.name}: fps is {self.fps}; it must be positive.")
+        self._check_shapes()
+        self._check_values()
+        for body in self.objects:
+            self._check_mesh(body)
+        self._check_length()
+
+    def _check_shapes(self) -> None:
+        frames = self.num_frames
+        for side, track in self.keypoints.items():
+            if side not in SIDES:
+                raise DemoError(f"{self.name}: hand '{side}'; allowed: left, right.")
+            self._check_shape(f"keypoints of the {side} hand", track, (frames, 21, 3))
+            if side not in self.palm:
+                raise DemoError(f"{self.name}: the {side} hand has no palm pose.")
+            self._check_shape(f"palm of the {side} hand", self.palm[side], (frames, 7))
+        for body in self.objects:
+            self._check_shape(f"pose of object '{body.name}'", body.pose, (frames, 7))
+        for side, slot in self.hand_object.items():
+            if side not in self.keypoints or not 0 <= slot < len(self.objects):
+                raise DemoError(
+                    f"{self.name}: hand_object[{side!r}] = {slot}, but there are "
+                    f"{len(self.objects)} objects and hands {sorted(self.keypoints)}."
+                )
+
+    def _check_shape(self, what: str, array: np.ndarray, shape: tuple) -> None:
+        if array.shape != shape:
+            raise DemoError(
+                f"{self.name}: {what} has shape {array.shape}, expected {shape} "
+                f"(all tracks of a motion have the same number of frames)."
+            )
+
+    def _check_values(self) -> None:
+        tracks = {f"keypoints of the {s} hand": k for s, k in self.keypoints.items()}
+        tracks |= {f"palm of the {s} hand": p for s, p in self.palm.items()}
+        tracks |= {f"pose of object '{b.name}'": b.pose for b in self.objects}
+        for what, track in tracks.items():
+            bad = ~np.isfinite(track.reshape(len(track), -1)).all(axis=1)
+            if bad.any():
+                raise DemoError(
+                    f"{self.name}: {what} holds NaN or infinity in {bad.sum()} frames, "
+                    f"first in frame {int(bad.argmax())}. Interpolate or cut them."
+                )
+            if track.shape[-1] == 7:
+                self._check_quats(what, track[:, 3:])
+
+    def _check_quats(self, what: str, quats: np.ndarray) -> None:
+        off = np.abs(np.linalg.norm(quats, axis=-1) - 1)
+        if (off > QUAT_TOLERANCE).any():
+            frame = int(off.argmax())
+            raise DemoError(
+                f"{self.name}: {what}: quaternion of frame {frame} has norm "
+                f"{np.linalg.norm(quats[frame]):.3f}. Quaternions are wxyz, unit."
+            )
+
+    def _check_mesh(self, body: DemoObject) -> None:
+        if isinstance(body.mesh, trimesh.Trimesh):
+            if len(body.mesh.faces) < 4:
+                raise DemoError(f"{self.name}: mesh of '{body.name}' has no volume.")
+        elif not Path(body.mesh).is_file():
+            raise DemoError(
+                f"{self.name}: mesh of object '{body.name}' not found: {body.mesh}"
+            )
+
+    def _check_length(self) -> None:
+        if self.num_frames < MIN_FRAMES or self.seconds < MIN_SECONDS:
+            raise DemoError(
+                f"{self.name}: too short: {self.num_frames} frames, "
+                f"{self.seconds:.2f} s; at least {MIN_FRAMES} frames and "
+                f"{MIN_SECONDS} s are needed."
+            )
+
+    def cut(self, start: int, end: int, *, name: str) -> HumanDemo:
+        """The frames ``start`` (included) to ``end`` (excluded) as a motion of its own.
+
+        Args:
+            start: first frame.
+            end: one past the last frame.
+            name: of the piece.
+        """
+        return HumanDemo(
+            name=name,
+            fps=self.fps,
+            keypoints={s: k[start:end] for s, k in self.keypoints.items()},
+            palm={s: p[start:end] for s, p in self.palm.items()},
+            objects=[DemoObject(b.name, b.mesh, b.pose[start:end]) for b in self.objects],
+            hand_object=dict(self.hand_object),
+            source=self.source,
+            licence=self.licence,
+            up=self.up,
+            support_z=self.support_z,
+        )

@@ -1,0 +1,95 @@
+"""A robot hand as spheres on its links: what keeps its reference out of objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from flashdex.hands.spec import SIDES, HandSpec, Side
+
+
+@dataclass
+class HandSpheres:
+    """Spheres that fill the collision geoms of both hands; [left, right].
+
+    Args:
+        link: link of each sphere, (S,).
+        pos: centres in the link's frame, m, (2, S, 3).
+        radius: m, (S,).
+        distal: finger (0 to 4) of spheres on a distal link, else -1, (S,).
+    """
+
+    link: Tensor
+    pos: Tensor
+    radius: Tensor
+    distal: Tensor
+
+
+def make_spheres(specs: Mapping[Side, HandSpec]) -> HandSpheres:
+    """Spheres of both hands; capsules and boxes are filled, other geoms refused.
+
+    Args:
+        specs: left and right hand, as returned by ``load_hand``.
+    """
+    models = [mujoco.MjSpec.from_string(specs[s].mjcf).compile() for s in SIDES]
+    # both sides get as many spheres, though their sizes differ by fractions of a mm
+    hands = [
+        _spheres_of(specs[side], model, models[0].geom_size)
+        for side, model in zip(SIDES, models, strict=True)
+    ]
+    links, _, radii = hands[0]
+    tips = {int(link): f for f, link in enumerate(specs["left"].tip_link)}
+    return HandSpheres(
+        link=torch.tensor(links),
+        pos=torch.tensor(np.stack([h[1] for h in hands])),
+        radius=torch.tensor(radii, dtype=torch.float64),
+        distal=torch.tensor([tips.get(link, -1) for link in links]),
+    )
+
+
+def _spheres_of(
+    spec: HandSpec, model: mujoco.MjModel, like: np.ndarray
+) -> tuple[list[int], np.ndarray, list[float]]:
+    names = [n.removeprefix(spec.prefix) for n in spec.link_names]
+    links, centres, radii = [], [], []
+    for geom in range(model.ngeom):
+        if model.geom_contype[geom] == 0 and model.geom_conaffinity[geom] == 0:
+            continue
+        body = mujoco.mj_id2name(
+            model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])
+        )
+        local, radius = _fill(int(model.geom_type[geom]), model.geom_size[geom], like[geom])
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        points = local @ matrix.reshape(3, 3).T + model.geom_pos[geom]
+        links += [names.index(body)] * len(points)
+        centres.append(points)
+        radii += [radius] * len(points)
+    return links, np.concatenate(centres), radii
+
+
+def _fill(kind: int, size: np.ndarray, like: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centres (K, 3) and radius of spheres that fill a geom, as many as ``like`` needs."""
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.zeros((1, 3)), float(size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        radius, half = float(size[0]), float(size[1])
+        count = 1 + int(np.ceil(2 * like[1] / (0.8 * like[0])))
+        line = np.linspace(-half, half, count)
+        return np.stack([0 * line, 0 * line, line], axis=1), radius
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        radius = float(size.min())
+        axes = [
+            np.linspace(radius - s, s - radius, 1 + int(np.ceil(extra)))
+            if extra > 0.1
+            else np.zeros(1)
+            for s, extra in zip(size, like / like.min() - 1, strict=True)
+        ]
+        return np.array(list(product(*axes))), radius
+    raise ValueError(f"geom type {kind}: only spheres, capsules and boxes are filled")

@@ -1,0 +1,239 @@
+"""Writes a motion library in one step: complete, or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from tensordict import TensorDict
+
+from flashdex.errors import LibraryError
+from flashdex.motions.library import FRAME_KEYS, SCHEMA
+from flashdex.motions.objects import ObjectAsset
+
+CONVENTIONS = {
+    "units": {"length": "m", "angle": "rad", "time": "s", "mass": "kg"},
+    "up": "z",
+    "quat": "wxyz",
+    "hands": ["left", "right"],
+    "fingers": ["thumb", "index", "middle", "ring", "pinky"],
+}
+
+
+@dataclass
+class MotionRecord:
+    """One prepared motion, as it goes into the library.
+
+    Args:
+        name: unique in the library.
+        frames: every key of ``FRAME_KEYS``, (T, ...).
+        hand_active: which hands take part, [left, right].
+        hand_object: object slot of each hand, -1 for none.
+        objects: objects by slot; at most as many as there are slots.
+        support_disks: [x, y, z_top, radius, height], m, NaN unused, (4, 5).
+        info: what the manifest says about it (source, licence, status, figures).
+    """
+
+    name: str
+    frames: dict[str, np.ndarray]
+    hand_active: tuple[bool, bool]
+    hand_object: tuple[int, int]
+    objects: list[ObjectAsset]
+    support_disks: np.ndarray
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+class LibraryWriter:
+    """Collects motions and writes them as one library directory.
+
+    Everything is written to a temporary folder beside the target and renamed at the
+    end, so that a killed run leaves no library and an old one stays as it was.
+
+    Args:
+        path: directory of the library.
+        hand: robot hand of the joint references.
+        fps: control rate of all motions.
+        manifest: more entries of the manifest (settings, versions, source).
+    """
+
+    def __init__(
+        self, path: str | Path, *, hand: str, fps: float, manifest: dict | None = None
+    ) -> None:
+        self.path = Path(path)
+        self._manifest = {"schema": SCHEMA, **CONVENTIONS, "hand": hand, "fps": fps}
+        self._manifest |= manifest or {}
+        self._records: list[MotionRecord] = []
+        self._objects: dict[str, ObjectAsset] = {}
+
+    def add(self, record: MotionRecord) -> None:
+        """Add one motion; objects that are equal are stored once."""
+        missing = [k for k in FRAME_KEYS if k not in record.frames]
+        lengths = {len(v) for v in record.frames.values()}
+        if missing or len(lengths) != 1:
+            raise LibraryError(
+                f"{record.name}: frames lack {missing} or differ in length {lengths}."
+            )
+        if record.name in {r.name for r in self._records}:
+            raise LibraryError(f"two motions are called '{record.name}'.")
+        for asset in record.objects:
+            self._objects.setdefault(asset.sha256, asset)
+        self._records.append(record)
+
+    def write(self, *, report: str = "") -> Path:
+        """Write the library, replacing one of the same name.
+
+        Args:
+            report: content of report.csv.
+
+        Raises:
+            LibraryError: when there is nothing to write or the disk refuses; nothing
+                is left behind then.
+        """
+        if not self._records:
+            raise LibraryError(f"{self.path}: no motion was kept; nothing to write.")
+        work = None
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            prefix = f".{self.path.name}-"
+            work = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
+            self._fill(work, report)
+            _swap(work, self.path)
+        except (OSError, RuntimeError) as error:
+            raise LibraryError(
+                f"{self.path}: could not write the library ({error}). Check free "
+                f"space and permissions of {self.path.parent}."
+            ) from error
+        finally:
+            if work is not None:
+                shutil.rmtree(work, ignore_errors=True)
+        return self.path
+
+    def _fill(self, work: Path, report: str) -> None:
+        os.chmod(work, 0o755)  # mkdtemp makes it private
+        names = _unique_names(list(self._objects.values()))
+        files = [
+            _write_meshes(work, name, asset)
+            for name, asset in zip(names, self._objects.values(), strict=True)
+        ]
+        self._stack_frames().memmap(work / "frames")
+        self._stack_motions().memmap(work / "motions")
+        _stack_objects(list(self._objects.values())).memmap(work / "objects")
+        manifest = self._manifest | {
+            "motions": [{"name": r.name, **r.info} for r in self._records],
+            "objects": [
+                {"name": n, "sha256": a.sha256, "watertight": bool(a.watertight), **f}
+                for n, a, f in zip(names, self._objects.values(), files, strict=True)
+            ],
+        }
+        (work / "report.csv").write_text(report, encoding="utf-8")
+        text = json.dumps(manifest, indent=1)
+        (work / "manifest.json").write_text(text, encoding="utf-8")
+
+    def _stack_frames(self) -> TensorDict:
+        stacked = {
+            k: np.concatenate([r.frames[k] for r in self._records]) for k in FRAME_KEYS
+        }
+        total = len(stacked["joint_pos"])
+        tensors = {k: torch.as_tensor(v).float() for k, v in stacked.items()}
+        return TensorDict(tensors, batch_size=[total])
+
+    def _stack_motions(self) -> TensorDict:
+        lengths = torch.tensor([len(r.frames["joint_pos"]) for r in self._records])
+        rows = {sha: i for i, sha in enumerate(self._objects)}
+        slots = self._records[0].frames["object_pos"].shape[1]
+        index = torch.full((len(self._records), slots), -1)
+        for i, record in enumerate(self._records):
+            for slot, asset in enumerate(record.objects):
+                index[i, slot] = rows[asset.sha256]
+        disks = np.stack([r.support_disks for r in self._records])
+        return TensorDict(
+            {
+                "start": lengths.cumsum(0) - lengths,
+                "length": lengths,
+                "hand_active": torch.tensor([r.hand_active for r in self._records]),
+                "hand_object": torch.tensor([r.hand_object for r in self._records]),
+                "object_index": index,
+                "support_disks": torch.as_tensor(disks).float(),
+            },
+            batch_size=[len(self._records)],
+        )
+
+
+def _stack_objects(assets: list[ObjectAsset]) -> TensorDict:
+    fields = {
+        "points": [a.points for a in assets],
+        "normals": [a.normals for a in assets],
+        "radius": [a.radius for a in assets],
+        "sdf": [a.sdf for a in assets],
+        "sdf_origin": [a.sdf_origin for a in assets],
+        "sdf_spacing": [a.sdf_spacing for a in assets],
+        "mass": [a.mass for a in assets],
+        "com": [a.com for a in assets],
+        "inertia": [a.inertia for a in assets],
+        "aabb": [a.aabb for a in assets],
+    }
+    stacked = {k: torch.as_tensor(np.stack(v)).float() for k, v in fields.items()}
+    return TensorDict(stacked, batch_size=[len(assets)])
+
+
+def _unique_names(assets: list[ObjectAsset]) -> list[str]:
+    seen: dict[str, int] = {}
+    names = []
+    for asset in assets:
+        count = seen[asset.name] = seen.get(asset.name, 0) + 1
+        names.append(asset.name if count == 1 else f"{asset.name}_{count}")
+    return names
+
+
+def _write_meshes(work: Path, name: str, asset: ObjectAsset) -> dict[str, Any]:
+    folder = Path("meshes") / name
+    (work / folder).mkdir(parents=True)
+    parts = []
+    for i, part in enumerate(asset.parts):
+        file = folder / f"part_{i:03d}.obj"
+        hull = trimesh.convex.convex_hull(part)
+        _write_obj(work / file, part, _faces_of(hull, part))
+        parts.append(str(file))
+    visual = folder / "visual.obj"
+    _write_obj(work / visual, asset.visual_vertices, asset.visual_faces)
+    return {"parts": parts, "visual": str(visual)}
+
+
+def _faces_of(hull: trimesh.Trimesh, vertices: np.ndarray) -> np.ndarray:
+    """Faces of a convex hull, indexed into ``vertices`` (which keep their order)."""
+    gaps = np.linalg.norm(hull.vertices[:, None] - vertices[None], axis=-1)
+    return gaps.argmin(axis=1)[hull.faces]
+
+
+def _write_obj(file: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices)]
+    lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + 1]
+    file.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _swap(work: Path, target: Path) -> None:
+    """Put ``work`` in the place of ``target``; the old one is kept until it stands."""
+    old = None
+    if target.exists():
+        if not (target / "manifest.json").is_file():
+            raise LibraryError(
+                f"{target} exists and is not a motion library; it is not replaced."
+            )
+        old = target.with_name(f".{target.name}-old-{os.getpid()}")
+        os.replace(target, old)
+    try:
+        os.replace(work, target)
+    except OSError:
+        if old is not None:
+            os.replace(old, target)
+        raise
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,178 @@
+"""Object meshes: reading, refusing what cannot be simulated, cleaning, sampling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import QhullError
+
+from flashdex.errors import MeshError
+from flashdex.geometry.points import farthest_point_sampling
+
+MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
+MIN_PART_AREA = 0.01  # share of the area below which a loose component is dropped
+SAMPLES_PER_POINT = 64  # density of the sample that farthest points are chosen from
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """Read one mesh from any file trimesh reads.
+
+    Scenes become one mesh, each geometry moved by the transform of its node.
+
+    Args:
+        path: mesh file; its unit is taken to be the metre.
+
+    Returns:
+        The mesh as stored, not cleaned.
+
+    Raises:
+        MeshError: the file is missing or cannot be read.
+    """
+    if not path.is_file():
+        raise MeshError(f"{path}: mesh file not found. Check the path in the source.")
+    try:
+        scene = trimesh.load_scene(path, process=False, skip_materials=True)
+        mesh = scene.to_mesh()
+    except Exception as error:  # each reader of trimesh fails in its own way
+        raise MeshError(
+            f"{path}: not readable as a mesh ({error}). "
+            "Allowed: obj, ply, stl, glb and other formats of trimesh."
+        ) from error
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
+    """Check a mesh and repair what can be repaired without changing its shape.
+
+    Merges vertices, drops faces without area and loose components below 1 % of the
+    area, makes the winding consistent and outward, closes small holes.
+
+    Args:
+        mesh: as loaded, m.
+        name: file or object, for messages.
+
+    Returns:
+        A new mesh; it may still have holes.
+
+    Raises:
+        MeshError: nothing to simulate: empty, too few vertices, not finite, flat, or
+            of a size that points to another unit.
+    """
+    _refuse_unusable(mesh, name)
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    _drop_loose_components(mesh)
+    mesh.remove_unreferenced_vertices()
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        trimesh.repair.fix_inversion(mesh, multibody=True)
+    if not mesh.is_watertight:
+        trimesh.repair.fill_holes(mesh)
+    if mesh.volume < 0:
+        mesh.invert()
+    _refuse_flat(mesh, name)
+    return mesh
+
+
+def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
+    if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
+        raise MeshError(f"{name}: the mesh is empty (no triangles). Export it again.")
+    if not np.isfinite(mesh.vertices).all():
+        bad = int((~np.isfinite(mesh.vertices)).any(axis=-1).sum())
+        raise MeshError(f"{name}: {bad} vertices are not finite (NaN or infinite).")
+    distinct = len(np.unique(mesh.vertices, axis=0))
+    if distinct < 4:
+        raise MeshError(f"{name}: {distinct} distinct vertices; a solid needs 4.")
+    extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+    if not MIN_EXTENT <= extent <= MAX_EXTENT:
+        unit = "millimetres: scale by 0.001" if extent > MAX_EXTENT else "another unit"
+        raise MeshError(
+            f"{name}: the mesh is {extent:.4g} m long; allowed are {MIN_EXTENT} m to "
+            f"{MAX_EXTENT} m. Vertices must be metres; these look like {unit}."
+        )
+
+
+def _refuse_flat(mesh: trimesh.Trimesh, name: str) -> None:
+    try:
+        volume = float(mesh.convex_hull.volume) if len(mesh.faces) else 0.0
+    except QhullError:
+        volume = 0.0
+    # Below this share of the cube around it, it is a sheet and not a thin solid.
+    if volume < 1e-6 * float(mesh.extents.max() if len(mesh.faces) else 1.0) ** 3:
+        raise MeshError(
+            f"{name}: the convex hull has no volume; the mesh is flat. "
+            "Give it a thickness."
+        )
+
+
+def _drop_loose_components(mesh: trimesh.Trimesh) -> None:
+    labels = trimesh.graph.connected_component_labels(
+        mesh.face_adjacency, node_count=len(mesh.faces)
+    )
+    area = np.bincount(labels, weights=mesh.area_faces)
+    large = area >= MIN_PART_AREA * area.sum()
+    # A triangle soup consists of small components only: then they are the shape.
+    if area[large].sum() > 0.9 * area.sum():
+        mesh.update_faces(large[labels])
+
+
+def reduce_mesh(mesh: trimesh.Trimesh, *, max_faces: int) -> trimesh.Trimesh:
+    """Fewer faces, for drawing: vertices that share a cell become their mean.
+
+    Args:
+        mesh: any triangles, m.
+        max_faces: the limit; a mesh within it is returned as it is.
+    """
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    extent = float(mesh.extents.max())
+    low, high = extent / 512, extent / 4
+    best = _cluster(mesh, high)
+    for _ in range(10):
+        cell = np.sqrt(low * high)
+        trial = _cluster(mesh, cell)
+        if len(trial.faces) <= max_faces:
+            high, best = cell, trial
+        else:
+            low = cell
+    return best
+
+
+def _cluster(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
+    key = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    group = group.ravel()
+    count = np.bincount(group)[:, None]
+    mean = (
+        np.stack([np.bincount(group, weights=x) for x in mesh.vertices.T], -1) / count
+    )
+    merged = trimesh.Trimesh(mean, group[mesh.faces], process=False)
+    merged.update_faces(merged.nondegenerate_faces() & merged.unique_faces())
+    merged.remove_unreferenced_vertices()
+    return merged
+
+
+def sample_surface_points(
+    mesh: trimesh.Trimesh, count: int, *, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Evenly spread surface points in farthest-point order, with outward normals.
+
+    Args:
+        mesh: triangles in the object frame, m.
+        count: number of points, P.
+        seed: of the dense area-weighted sample.
+
+    Returns:
+        Points, m, (P, 3), and unit normals of their triangles, (P, 3).
+    """
+    dense, face = trimesh.sample.sample_surface(
+        mesh, SAMPLES_PER_POINT * count, seed=seed
+    )
+    order = farthest_point_sampling(torch.from_numpy(np.asarray(dense)), count).numpy()
+    normals = mesh.face_normals[face[order]]
+    return np.float32(dense[order]), np.float32(normals)

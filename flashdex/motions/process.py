@@ -1,0 +1,200 @@
+"""From one demonstration to one library motion: align, reference, check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from flashdex.errors import DemoError, MeshError
+from flashdex.geometry.rotation import quat_mul, quat_rotate
+from flashdex.geometry.sdf import SdfGrid
+from flashdex.hands.spec import load_hand
+from flashdex.motions.align import AlignedDemo, align
+from flashdex.motions.checks import Finding, check_aligned, check_demo, check_retarget
+from flashdex.motions.checks import status_of
+from flashdex.motions.contacts import NO_OBJECT, blend
+from flashdex.motions.demo import HumanDemo
+from flashdex.motions.library import NUM_OBJECT_SLOTS
+from flashdex.motions.library_writer import MotionRecord
+from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
+from flashdex.motions.penetration import make_reference_scene, measure_penetration
+from flashdex.motions.residuals import RetargetWeights, Targets
+from flashdex.motions.retarget import Retargeter
+from flashdex.motions.support import support_disks
+from flashdex.motions.tracks import angular_velocity, linear_velocity
+
+# where the joints of a hand that takes no part rest, m: out of everyone's way
+PARKED = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+MIDDLE_KNUCKLE = 9
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """How motions are prepared.
+
+    Args:
+        hand: robot hand.
+        control_hz: frames a second of the references.
+        objects: how meshes become objects.
+        weights: of the retargeting.
+        cache_dir: of prepared objects; the user's cache by default.
+    """
+
+    hand: str = "xhand"
+    control_hz: float = 60.0
+    objects: ObjectSettings = field(default_factory=ObjectSettings)
+    weights: RetargetWeights = field(default_factory=RetargetWeights)
+    cache_dir: Path | None = None
+
+
+@dataclass
+class Prepared:
+    """Outcome of one motion: its record unless rejected, and its row of the report."""
+
+    record: MotionRecord | None
+    row: dict[str, Any]
+
+
+def prepare_motion(demo: HumanDemo, settings: MotionSettings) -> Prepared:
+    """Prepare one motion; a fault of the recording becomes a rejected row.
+
+    Args:
+        demo: the recording.
+        settings: how.
+    """
+    row: dict[str, Any] = {"motion": demo.name}
+    findings: list[Finding] = []
+    record = None
+    try:
+        demo.validate()
+        findings += check_demo(demo)
+        if status_of(findings) != "rejected":
+            record = _prepare(demo, settings, findings, row)
+    except (DemoError, MeshError) as error:
+        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
+        findings.append(Finding(code, "reject", str(error)))
+    row["status"] = status_of(findings)
+    row["reason"] = "; ".join(f"{f.code}: {f.text}" for f in findings)
+    if row["status"] == "rejected" or record is None:
+        return Prepared(None, row)
+    record.info |= {"status": row["status"], "reason": row["reason"]}
+    return Prepared(record, row)
+
+
+def _prepare(
+    demo: HumanDemo, settings: MotionSettings, findings: list[Finding], row: dict
+) -> MotionRecord | None:
+    aligned = align(demo, control_hz=settings.control_hz)
+    assets = [
+        make_object(m, settings=settings.objects, cache_dir=settings.cache_dir, name=n)
+        for m, n in zip(aligned.meshes, aligned.object_names, strict=True)
+    ]
+    sdf = make_slot_grid(assets)
+    early, figures = check_aligned(aligned, assets, sdf)
+    findings += early
+    row |= figures
+    if status_of(findings) == "rejected":
+        return None
+    specs = load_hand(settings.hand)
+    retargeter = Retargeter(specs, weights=settings.weights)
+    targets = make_targets(aligned, retargeter)
+    result = retargeter.solve(targets, sdf)
+    joint_pos = _park(result.joint_pos, aligned.active)
+    scene = make_reference_scene(specs, [a.parts for a in assets])
+    depth = measure_penetration(scene, joint_pos, aligned.poses, active=aligned.active)
+    ranges = np.stack([specs["left"].joint_range, specs["right"].joint_range])
+    late, figures = check_retarget(aligned, joint_pos, result.tip_error, depth, ranges)
+    findings += late
+    row |= figures
+    vertices = [np.asarray(m.vertices) for m in aligned.meshes]
+    return MotionRecord(
+        name=demo.name,
+        frames=make_frames(aligned, joint_pos, targets),
+        hand_active=tuple(bool(a) for a in aligned.active),
+        hand_object=tuple(int(s) for s in aligned.hand_object),
+        objects=assets,
+        support_disks=support_disks(aligned.poses, vertices, aligned.fps),
+        info={
+            "source": demo.source,
+            "licence": demo.licence,
+            "source_fps": demo.fps,
+            "objects": aligned.object_names,
+            "support_z": aligned.support_z,
+        },
+    )
+
+
+def make_slot_grid(assets: list[ObjectAsset]) -> SdfGrid:
+    """Distance grids of a motion's objects in float64, row = slot."""
+    return SdfGrid(
+        torch.tensor(np.stack([a.sdf for a in assets])).double(),
+        torch.tensor(np.stack([a.sdf_origin for a in assets])).double(),
+        torch.tensor([float(a.sdf_spacing) for a in assets]).double(),
+    )
+
+
+def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
+    """What the robot hands should reach in every frame.
+
+    The base is placed so that the robot's middle knuckle meets the human one: the
+    robot's palm is longer than a human's.
+    """
+    palm = torch.tensor(aligned.palm)
+    wrist_quat = quat_mul(palm[..., 3:], retargeter.hand.wrist_from_palm.expand_as(
+        palm[..., 3:]))
+    keypoints = torch.tensor(aligned.keypoints)
+    arm = quat_rotate(wrist_quat, retargeter.hand.knuckle.expand(*palm.shape[:-1], 3))
+    poses = torch.tensor(np.stack(aligned.poses, axis=1))
+    weight = np.stack([blend(aligned.contact[:, h]) for h in range(2)], axis=1)
+    return Targets(
+        tips=keypoints[..., [4, 8, 12, 16, 20], :],
+        wrist_pos=keypoints[..., MIDDLE_KNUCKLE, :] - arm,
+        wrist_quat=wrist_quat,
+        contact=torch.tensor(weight),
+        hand_object=torch.tensor(aligned.hand_object),
+        object_pos=poses[..., :3],
+        object_quat=poses[..., 3:],
+    )
+
+
+def _park(joint_pos: np.ndarray, active: np.ndarray) -> np.ndarray:
+    joint_pos = joint_pos.copy()
+    for hand in np.flatnonzero(~active):
+        joint_pos[:, hand] = 0.0
+        joint_pos[:, hand, :3] = PARKED[hand]
+    return joint_pos
+
+
+def make_frames(
+    aligned: AlignedDemo, joint_pos: np.ndarray, targets: Targets
+) -> dict[str, np.ndarray]:
+    """All per-frame entries of the library, float32."""
+    fps, frames = aligned.fps, aligned.num_frames
+    poses = np.zeros((frames, NUM_OBJECT_SLOTS, 7))
+    poses[..., 3] = 1.0
+    for slot, pose in enumerate(aligned.poses):
+        poses[:, slot] = pose
+    wrist_quat = targets.wrist_quat.numpy()
+    turns = [angular_velocity(wrist_quat[:, h], fps) for h in range(2)]
+    spins = [angular_velocity(poses[:, s, 3:], fps) for s in range(NUM_OBJECT_SLOTS)]
+    tip_dist = np.where(aligned.active[:, None], aligned.tip_dist, NO_OBJECT)
+    entries = {
+        "joint_pos": joint_pos,
+        "joint_vel": linear_velocity(joint_pos, fps),
+        "wrist_pos": aligned.keypoints[:, :, 0],
+        "wrist_quat": wrist_quat,
+        "wrist_linvel": linear_velocity(aligned.keypoints[:, :, 0], fps),
+        "wrist_angvel": np.stack(turns, axis=1),
+        "keypoints": aligned.keypoints,
+        "keypoint_linvel": linear_velocity(aligned.keypoints, fps),
+        "tip_dist": tip_dist,
+        "object_pos": poses[..., :3],
+        "object_quat": poses[..., 3:],
+        "object_linvel": linear_velocity(poses[..., :3], fps),
+        "object_angvel": np.stack(spins, axis=1),
+    }
+    return {k: v.astype(np.float32) for k, v in entries.items()}

@@ -1,0 +1,104 @@
+"""Joint references of both robot hands: batched inverse kinematics that holds contact.
+
+Every frame of a motion is solved at once by damped least squares,
+    (J^T J + mu I) dq = -J^T r,
+with residuals for fingertips, wrist, posture, smoothness, contact and penetration. In
+contact frames the tips are pulled along the object's distance gradient until the pads
+lie slightly inside its surface; all other parts of the hand are kept out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flashdex.geometry.sdf import SdfGrid
+from flashdex.hands.kinematics import HandKinematics
+from flashdex.hands.spec import HandSpec, Side
+from flashdex.motions.hand_jacobian import HandJacobian
+from flashdex.motions.hand_model import HandModel
+from flashdex.motions.residuals import Residuals, RetargetWeights, Targets
+from flashdex.motions.wrist import unwrap_wrist
+
+MAX_STEP = 0.15  # m or rad a joint and iteration
+
+
+@dataclass
+class RetargetResult:
+    """A joint reference.
+
+    Args:
+        joint_pos: m and rad, (T, 2, J).
+        tip_error: robot pad to human tip, m, (T, 2, 5).
+    """
+
+    joint_pos: np.ndarray
+    tip_error: np.ndarray
+
+
+class Retargeter:
+    """Solves joint references for one embodiment.
+
+    Args:
+        specs: left and right hand, as returned by ``load_hand``.
+        weights: of the residuals.
+
+    Example:
+        >>> retargeter = Retargeter(load_hand("xhand"))  # doctest: +SKIP
+        >>> result = retargeter.solve(targets, sdf)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self, specs: Mapping[Side, HandSpec], *, weights: RetargetWeights | None = None
+    ) -> None:
+        self.weights = weights or RetargetWeights()
+        self.hand = HandModel(specs)
+        self._kinematics = HandKinematics(specs).double()
+        self._jacobian = HandJacobian(specs)
+
+    @torch.no_grad()
+    def solve(self, targets: Targets, sdf: SdfGrid) -> RetargetResult:
+        """Joint references of all frames of a motion; both hands at once.
+
+        Args:
+            targets: what the human hands and the objects do.
+            sdf: distance grids of the objects, row = slot, float64.
+        """
+        residuals = Residuals(self.hand, targets, sdf, self.weights)
+        free, held = self.weights.free_iterations, self.weights.contact_iterations
+        q = self._initial(targets)
+        for step in range(free + held):
+            q = self._iterate(q, residuals, contact=step >= free)
+        error = (self._kinematics(q)["tip_pos"] - targets.tips).norm(dim=-1)
+        return RetargetResult(q.numpy(), error.numpy())
+
+    def _initial(self, targets: Targets) -> Tensor:
+        """Wrist as the human palm wants it, fingers relaxed."""
+        q = self.hand.relaxed.repeat(len(targets.tips), 1, 1)
+        q[..., :3] = targets.wrist_pos
+        for hand in range(2):
+            quats = targets.wrist_quat[:, hand].numpy()
+            q[:, hand, 3:6] = torch.tensor(unwrap_wrist(quats))
+        return q.clamp(self.hand.low, self.hand.high)
+
+    def _iterate(self, q: Tensor, residuals: Residuals, *, contact: bool) -> Tensor:
+        pose = self._kinematics(q)
+        frames = self._jacobian.frames(q, pose["link_pos"], pose["link_quat"])
+        slope = torch.zeros_like(q)
+        eye = self.weights.damping * torch.eye(q.shape[-1], dtype=q.dtype)
+        curvature = eye.expand(*q.shape, q.shape[-1]).clone()
+        for residual, jac in residuals.evaluate(q, pose, frames, contact=contact):
+            slope += torch.einsum("thr,thrj->thj", residual, jac)
+            curvature += jac.transpose(-1, -2) @ jac
+        # a joint at its limit that is pushed outwards takes no part in the step
+        out = ((q <= self.hand.low) & (slope > 0)) | ((q >= self.hand.high) & (slope < 0))
+        slope = torch.where(out, 0.0, slope)
+        curvature = torch.where(out[..., None] | out[..., None, :], 0.0, curvature)
+        curvature += torch.diag_embed(out.to(q.dtype))
+        step = -torch.linalg.solve(curvature, slope)
+        scale = (MAX_STEP / step.abs().amax(-1, keepdim=True)).clamp(max=1.0)
+        return (q + scale * step).clamp(self.hand.low, self.hand.high)

@@ -1,0 +1,121 @@
+"""Reads recordings given as hand keypoints and object poses, one .npz a recording.
+
+Keys: ``fps``, ``object`` (the mesh is ``meshes/<object>.obj`` beside the file),
+``obj_pose`` (T, 7), and per recorded hand ``kp_left`` (T, 21, 3) and ``palm_left`` (T, 7),
+likewise right. Metres, quaternions wxyz, z up. ``segments*.json`` beside the files cuts
+recordings into motions called ``<clip>_<start>_<end>``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from flashdex.errors import DemoError
+from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
+from flashdex.motions.meshes import load_mesh
+from flashdex.motions.support import estimate_support
+from flashdex.motions.tracks import palm_frame
+
+REQUIRED = ("fps", "object", "obj_pose")
+SOURCE = "keypoints"
+
+
+def read_keypoints(path: str | Path, *, limit: int | None = None) -> list[HumanDemo]:
+    """Recordings of a folder or one file, in name order.
+
+    Args:
+        path: a folder of .npz files, or one of them.
+        limit: at most this many motions.
+
+    Raises:
+        DemoError: says what is missing, and where.
+    """
+    path = Path(path)
+    files = [path] if path.is_file() else sorted(path.glob("*.npz"))
+    if not files:
+        raise DemoError(
+            f"{path}: no .npz recordings. Expected a folder with <clip>.npz files and "
+            f"meshes/<object>.obj, or one such file."
+        )
+    segments = _read_segments(files[0].parent)
+    demos: list[HumanDemo] = []
+    for file in files:
+        if limit is not None and len(demos) >= limit:
+            break
+        demo = read_file(file)
+        pieces = segments.get(file.stem)
+        demos += [demo] if pieces is None else _cut(demo, pieces)
+    return demos[:limit]
+
+
+def read_file(file: Path) -> HumanDemo:
+    """One recording, uncut."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            data = {key: stored[key] for key in stored.files}
+    except (OSError, ValueError) as error:
+        raise DemoError(f"{file}: not a readable .npz without pickles: {error}") from error
+    missing = [key for key in REQUIRED if key not in data]
+    hands = [side for side in SIDES if f"kp_{side}" in data]
+    if missing or not hands:
+        lack = missing + ([] if hands else ["kp_left or kp_right"])
+        raise DemoError(f"{file}: lacks {', '.join(lack)}. Found: {', '.join(data)}.")
+    keypoints = {s: data[f"kp_{s}"].astype(np.float64) for s in hands}
+    name = str(data["object"])
+    licence = file.parent / "LICENSE"
+    return HumanDemo(
+        name=file.stem,
+        fps=float(data["fps"]),
+        keypoints=keypoints,
+        palm={s: _palm(data, s, keypoints) for s in hands},
+        objects=[
+            DemoObject(
+                name,
+                file.parent / "meshes" / f"{name}.obj",
+                data["obj_pose"].astype(np.float64),
+            )
+        ],
+        source=SOURCE,
+        licence=str(licence.name) if licence.is_file() else "",
+    )
+
+
+def _palm(data: dict, side: str, keypoints: dict) -> np.ndarray:
+    stored = data.get(f"palm_{side}")
+    return palm_frame(keypoints[side], side) if stored is None else np.float64(stored)
+
+
+def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
+    """Pieces (start, end) of each recording, from all ``segments*.json``."""
+    pieces: dict[str, list[tuple[int, int]]] = {}
+    for file in sorted(folder.glob("segments*.json")):
+        try:
+            rows = json.loads(file.read_text(encoding="utf-8"))
+            for row in rows:
+                span = (int(row["start"]), int(row["end"]))
+                pieces.setdefault(str(row["clip"]), []).append(span)
+        except (ValueError, KeyError, TypeError) as error:
+            raise DemoError(
+                f"{file}: expected a list of {{clip, start, end}}: {error!r}"
+            ) from error
+    return pieces
+
+
+def _cut(demo: HumanDemo, pieces: list[tuple[int, int]]) -> list[HumanDemo]:
+    """Pieces of a recording; they share the table that the whole recording shows."""
+    demo.validate()
+    meshes = [load_mesh(Path(b.mesh)) for b in demo.objects]
+    vertices = [np.asarray(m.vertices) for m in meshes]
+    poses = [b.pose for b in demo.objects]
+    height, found = estimate_support(poses, vertices, demo.fps)
+    demo.support_z = height if found else None
+    for start, end in pieces:
+        if not 0 <= start < end <= demo.num_frames:
+            raise DemoError(
+                f"{demo.name}: segment {start}-{end} is outside of its "
+                f"{demo.num_frames} frames."
+            )
+    return [demo.cut(a, b, name=f"{demo.name}_{a}_{b}") for a, b in pieces]

@@ -1,0 +1,118 @@
+"""Tracks over time: palm frame, resampling, velocities, smoothing (numpy, float64)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from flashdex.motions.demo import Side
+
+# frames of the Gaussian that smooths velocities (method.md 14)
+VELOCITY_SIGMA = 2.0
+
+
+def rotation(quat: np.ndarray) -> Rotation:
+    """Scipy rotation of quaternions (..., 4), wxyz."""
+    return Rotation.from_quat(quat, scalar_first=True)
+
+
+def to_quat(rot: Rotation) -> np.ndarray:
+    """Quaternions (..., 4), wxyz, of a scipy rotation."""
+    return rot.as_quat(scalar_first=True)
+
+
+def continuous(quats: np.ndarray) -> np.ndarray:
+    """Unit quaternions (T, 4) without sign flips; the first one has w >= 0."""
+    quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
+    dots = np.einsum("ti,ti->t", quats[1:], quats[:-1])
+    first = 1.0 if quats[0, 0] >= 0 else -1.0
+    signs = np.concatenate([[first], np.where(dots < 0, -1.0, 1.0)])
+    return quats * np.cumprod(signs)[:, None]
+
+
+def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
+    """Geometric palm pose of keypoints.
+
+    x = unit(middle MCP - wrist); z out of the palm, n = (index MCP - wrist) x (pinky
+    MCP - wrist) with operands swapped for the left hand, made orthogonal to x;
+    y = z x x.
+
+    Args:
+        keypoints: m, world, (T, 21, 3).
+        side: of the hand.
+
+    Returns:
+        Wrist position and quaternion wxyz, (T, 7).
+    """
+    wrist, index, middle, pinky = (keypoints[:, i] for i in (0, 5, 9, 17))
+    x = _unit(middle - wrist)
+    normal = np.cross(index - wrist, pinky - wrist)
+    normal = normal if side == "right" else -normal
+    z = _unit(normal - np.sum(normal * x, -1, keepdims=True) * x)
+    matrix = np.stack([x, np.cross(z, x), z], axis=-1)
+    quats = continuous(to_quat(Rotation.from_matrix(matrix)))
+    return np.concatenate([wrist, quats], axis=-1)
+
+
+def sample_times(num_frames: int, fps: float, target_fps: float) -> np.ndarray:
+    """Times of the resampled frames, s: from 0 to the last that the track covers."""
+    last = (num_frames - 1) / fps
+    return np.arange(int(np.floor(last * target_fps + 1e-6)) + 1) / target_fps
+
+
+def resample(values: np.ndarray, fps: float, times: np.ndarray) -> np.ndarray:
+    """Linear interpolation of a track (T, ...) at ``times`` (s)."""
+    index = np.clip(times * fps, 0, len(values) - 1)
+    low = np.minimum(index.astype(int), len(values) - 2)
+    part = (index - low).reshape(-1, *[1] * (values.ndim - 1))
+    return (1 - part) * values[low] + part * values[low + 1]
+
+
+def resample_pose(pose: np.ndarray, fps: float, times: np.ndarray) -> np.ndarray:
+    """Linear positions and slerped quaternions of a pose track (T, 7) at ``times``."""
+    slerp = Slerp(np.arange(len(pose)) / fps, rotation(continuous(pose[:, 3:])))
+    quats = continuous(to_quat(slerp(np.clip(times, 0, (len(pose) - 1) / fps))))
+    return np.concatenate([resample(pose[:, :3], fps, times), quats], axis=-1)
+
+
+def linear_velocity(
+    values: np.ndarray, fps: float, *, sigma: float = VELOCITY_SIGMA
+) -> np.ndarray:
+    """Central differences, (x_{t+1} - x_{t-1}) fps / 2, one-sided at the ends, smoothed.
+
+    Args:
+        values: track, (T, ...).
+        fps: frames a second.
+        sigma: of the Gaussian, frames; 0 for none.
+    """
+    speed = np.gradient(values, 1.0 / fps, axis=0)
+    return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
+
+
+def angular_velocity(
+    quats: np.ndarray, fps: float, *, sigma: float = VELOCITY_SIGMA
+) -> np.ndarray:
+    """Rotation rate in the world, log(R_{t+1} R_{t-1}^T) fps / 2, smoothed; rad/s.
+
+    Args:
+        quats: wxyz, (T, 4).
+        fps: frames a second.
+        sigma: of the Gaussian, frames; 0 for none.
+    """
+    rot = rotation(quats)
+    after = np.minimum(np.arange(len(quats)) + 1, len(quats) - 1)
+    before = np.maximum(np.arange(len(quats)) - 1, 0)
+    steps = (after - before)[:, None]
+    speed = (rot[after] * rot[before].inv()).as_rotvec() * fps / steps
+    return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
+
+
+def transform_pose(pose: np.ndarray, rot: Rotation) -> np.ndarray:
+    """A pose track (T, 7) seen from a world turned by ``rot``."""
+    quats = to_quat(rot * rotation(pose[:, 3:]))
+    return np.concatenate([rot.apply(pose[:, :3]), quats], axis=-1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(1e-9)

@@ -1,0 +1,1 @@
+"""FlashSAC losses, reward scale and updates; they know no environment."""

@@ -1,0 +1,142 @@
+"""Schema of the learning half of a recipe: algorithm, training, logging.
+
+These dataclasses are the one place of defaults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from flashdex.recipe.fields import number
+
+Criterion = Literal[
+    "sr_mt_obj",
+    "sr_mt",
+    "sr_mt_obj_x0.5",
+    "sr_mt_obj_x2",
+    "sr_mt_x0.5",
+    "sr_mt_x2",
+    "sr_loose",
+    "sr_mt_obj_frame",
+    "sr_mt_frame",
+    "sr_mt_obj_p95",
+    "sr_spider_centred",
+    "sr_spider_raw",
+    "sr_spider_worst",
+]
+CRITERIA: tuple[str, ...] = get_args(Criterion)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgoConfig:
+    """FlashSAC over groups of action dimensions."""
+
+    kind: Literal["flashsac"] = "flashsac"
+    """The algorithm."""
+    groups: Literal["per_hand", "unified"] = "per_hand"
+    """One actor-critic a hand, or one for both with summed reward."""
+    gamma: float = number(0.98, above=0, high=1)
+    """Discount a control step."""
+    n_step: int = number(5, low=1)
+    """Steps of the return before bootstrapping."""
+    batch_size: int = number(4096, low=2)
+    """Rows an update."""
+    updates_per_step: float = number(2.0, above=0)
+    """Updates a vector step (all worlds once)."""
+    buffer_size: int = number(50_000_000, low=1)
+    """Transitions kept; about 1 kB each."""
+    min_buffer: int = number(100_000, low=1)
+    """Transitions collected before learning."""
+    warmup: Literal["uniform", "policy"] = "uniform"
+    """Actions until then: uniform in [-1, 1], or the untrained policy with its noise,
+    which stays near the reference and suits residual actions."""
+    actor_width: int = number(128, low=8)
+    """Width of each actor tower."""
+    actor_blocks: int = number(2, low=1)
+    """Residual blocks of each actor tower."""
+    critic_width: int = number(1024, low=8)
+    """Width of each critic tower; the costliest number of the learner."""
+    critic_blocks: int = number(2, low=1)
+    """Residual blocks of each critic tower."""
+    num_atoms: int = number(101, low=3)
+    """Atoms of the categorical value."""
+    v_max: float = number(5.0, above=0)
+    """Value support is [-v_max, v_max], after reward normalisation."""
+    tau: float = number(0.01, above=0, high=1)
+    """Rate of the target networks."""
+    lr: float = number(3e-4, above=0)
+    """Learning rate at the start."""
+    lr_final: float = number(1.5e-4, low=0)
+    """Learning rate at the end of the cosine."""
+    actor_period: int = number(2, low=1)
+    """Critic updates an actor update."""
+    alpha_init: float = number(0.01, above=0)
+    """Temperature at the start, each group."""
+    target_std: float = number(0.15, above=0)
+    """Standard deviation that sets the target entropy, each action dimension."""
+    init_std: float = number(0.082, above=0, high=1)
+    """Standard deviation of the policy at the start (centred head)."""
+    head: Literal["centred", "normalised"] = "centred"
+    """centred starts at mean 0, on the reference; normalised is FlashSAC's own."""
+    future_latent: int = number(128, low=1)
+    """Width of the encoded future window."""
+    future_channels: list[int] = dataclasses.field(
+        default_factory=lambda: [128, 64, 32]
+    )
+    """Channels of the three convolutions of the future encoder."""
+    noise_max_repeat: int = number(16, low=1)
+    """Longest repetition of an exploration noise, control steps; 1 = fresh."""
+    noise_exponent: float = number(2.0, above=0)
+    """Exponent of the repetition lengths; larger repeats less."""
+    compile: bool = False
+    """Compile the updates (GPU); slow first minute, then faster."""
+    device: str = "auto"
+    """auto = GPU when there is one; or cpu, cuda, cuda:1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """The loop around the updates: evaluation, checkpoints, end."""
+
+    eval_every: int = number(20_000_000, low=1)
+    """Env steps between evaluations of every motion, besides the attempts."""
+    checkpoint_every_s: float = number(300.0, above=0)
+    """Seconds between checkpoints."""
+    keep_checkpoints: int = number(3, low=1)
+    """Newest checkpoints kept."""
+    checkpoint_buffer: bool = False
+    """Save the replay rows too; exact resume for a lot of disk."""
+    log_every_s: float = number(5.0, above=0)
+    """Seconds between log records."""
+    wall_limit_s: float | None = number(None, above=0)
+    """Stop cleanly after this many seconds; null = never."""
+    stop_when_all_converted: bool = True
+    """Stop once every motion is converted."""
+    criterion: Criterion = "sr_mt_obj"
+    """What counts as a conversion (see docs on criteria)."""
+    certify: bool = True
+    """Replay each conversion open loop in MuJoCo C and store the verdict."""
+    render_conversions: bool = True
+    """Write a small film of each conversion where a GL back end works."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggerConfig:
+    """Who writes the metrics."""
+
+    kind: list[Literal["jsonl", "csv", "wandb"]] = dataclasses.field(
+        default_factory=lambda: ["jsonl"]
+    )
+    """Writers; the JSON lines are the truth and are always written."""
+    wandb_project: str = "flashdex"
+    """W&B project."""
+    wandb_entity: str | None = None
+    """W&B team or user; null = your default."""
+    wandb_group: str | None = None
+    """W&B group; null = the recipe's name."""
+    wandb_mode: Literal["online", "offline"] = "online"
+    """offline writes files that `wandb sync` uploads later."""
+    wandb_tags: list[str] = dataclasses.field(default_factory=list)
+    """Tags beside hand, motions and engine."""

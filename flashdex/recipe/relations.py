@@ -1,0 +1,122 @@
+"""What must hold between values of a recipe that are each allowed on their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import flashdex.hands
+from flashdex.errors import nearest
+from flashdex.recipe.schema import Recipe
+
+
+def known_hands() -> list[str]:
+    """Return the names of the built-in hands (folders with a left and a right MJCF)."""
+    root = Path(flashdex.hands.__path__[0])
+    return sorted(path.parent.name for path in root.glob("*/left.xml"))
+
+
+def find_conflicts(recipe: Recipe) -> list[str]:
+    """Return one line for each thing that does not fit together."""
+    checks = (_hand, _motions, _rate, _replay, _algo, _env, _expect)
+    return [problem for check in checks for problem in check(recipe)]
+
+
+def _hand(recipe: Recipe) -> list[str]:
+    known = known_hands()
+    if recipe.hand in known:
+        return []
+    close = nearest(recipe.hand, known)
+    return [f"hand: '{recipe.hand}' is not a hand.{close} Known: {', '.join(known)}."]
+
+
+def _motions(recipe: Recipe) -> list[str]:
+    motions = recipe.motions
+    if motions.library is None and motions.source is None:
+        return [
+            "motions: neither library nor source is given; set motions.library to a "
+            "prepared folder or motions.source to procedural"
+        ]
+    if motions.source == "keypoints" and not (motions.input or motions.library):
+        return ["motions.input: missing; the source 'keypoints' reads a folder"]
+    return []
+
+
+def _rate(recipe: Recipe) -> list[str]:
+    physics, hz = recipe.physics, recipe.motions.control_hz
+    step = physics.decimation * physics.timestep
+    if abs(step * hz - 1) < 1e-3:
+        return []
+    return [
+        f"physics.timestep: {physics.decimation} substeps of {physics.timestep:.6g} s "
+        f"make {step:.6g} s, but motions.control_hz={hz:g} asks for {1 / hz:.6g} s; "
+        f"set physics.timestep={1 / hz / physics.decimation:.8g}"
+    ]
+
+
+def _replay(recipe: Recipe) -> list[str]:
+    algo = recipe.algo
+    problems = []
+    if algo.min_buffer > algo.buffer_size:
+        problems.append(
+            f"algo.min_buffer: {algo.min_buffer} rows never fit in algo.buffer_size="
+            f"{algo.buffer_size}; learning would not start"
+        )
+    if algo.min_buffer >= recipe.total_env_steps > 1:
+        problems.append(
+            f"algo.min_buffer: {algo.min_buffer} rows of random actions use up "
+            f"total_env_steps={recipe.total_env_steps}"
+        )
+    # The newest n steps of every world have no complete return yet.
+    if algo.buffer_size <= recipe.env.num_envs * algo.n_step:
+        problems.append(
+            f"algo.buffer_size: {algo.buffer_size} must exceed env.num_envs x "
+            f"algo.n_step = {recipe.env.num_envs * algo.n_step}"
+        )
+    return problems
+
+
+def _algo(recipe: Recipe) -> list[str]:
+    algo = recipe.algo
+    problems = []
+    if algo.lr_final > algo.lr:
+        problems.append(f"algo.lr_final: {algo.lr_final} is above algo.lr={algo.lr}")
+    if len(algo.future_channels) != 3 or min(algo.future_channels) < 1:
+        problems.append(
+            f"algo.future_channels: expected three positive numbers, found "
+            f"{algo.future_channels}"
+        )
+    device = algo.device.split(":")[0]
+    if device not in ("auto", "cpu", "cuda"):
+        problems.append(
+            f"algo.device: '{algo.device}' is not allowed. Allowed: auto, cpu, cuda, "
+            f"cuda:N."
+        )
+    return problems
+
+
+def _env(recipe: Recipe) -> list[str]:
+    env = recipe.env
+    problems = []
+    if not any(options is not None for options in env.transforms.values()):
+        problems.append("env.transforms: all are off; the policy would see nothing")
+    if env.attempt_share >= 1:
+        problems.append(
+            "env.attempt_share: 1 leaves no world to explore; use less than 1"
+        )
+    has_object_term = any(
+        env.rewards.get(name) is not None for name in ("object_points", "object_pose")
+    )
+    if env.terminations.get("early_reset") is not None and not has_object_term:
+        problems.append(
+            "env.terminations.early_reset: it sums the object term, but the rewards "
+            "object_points and object_pose are both off; turn one on"
+        )
+    return problems
+
+
+def _expect(recipe: Recipe) -> list[str]:
+    return [
+        f"expect[{i}]: give min, max or both"
+        for i, entry in enumerate(recipe.expect)
+        if entry.min is None and entry.max is None
+    ]

@@ -1,0 +1,68 @@
+"""The recipe: everything one training run is made of."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from flashdex.recipe.algo import AlgoConfig, LoggerConfig, TrainConfig
+from flashdex.recipe.env import EnvConfig, MotionsConfig, PhysicsConfig
+from flashdex.recipe.fields import number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expectation:
+    """A number the recipe promises, read by the job that trains it."""
+
+    metric: str
+    """Key of `metrics.jsonl`."""
+    at_env_steps: int = number(dataclasses.MISSING, low=1)
+    """Env steps at which it is read."""
+    min: float | None = None
+    """Smallest accepted value."""
+    max: float | None = None
+    """Largest accepted value."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """One training run, complete.
+
+    Example:
+        >>> Recipe(name="tiny", total_env_steps=1000).env.num_envs
+        2048
+    """
+
+    name: str
+    """Name of the recipe; taken from the file name when absent."""
+    total_env_steps: int = number(dataclasses.MISSING, low=1)
+    """Budget, control steps summed over worlds."""
+    ablation: str = "none"
+    """Ablation files that were applied; set by composing, not by hand."""
+    seed: int = number(0, low=0)
+    """Seed of everything that is drawn."""
+    run_dir: str | None = None
+    """Folder of the run; null = runs/<name>-<ablation>-s<seed>."""
+    hand: str = "xhand"
+    """Robot hand."""
+    motions: MotionsConfig = dataclasses.field(default_factory=MotionsConfig)
+    """Which motions."""
+    physics: PhysicsConfig = dataclasses.field(default_factory=PhysicsConfig)
+    """Which engine."""
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    """Environment."""
+    algo: AlgoConfig = dataclasses.field(default_factory=AlgoConfig)
+    """Learner."""
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    """Loop."""
+    logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
+    """Metric writers."""
+    expect: list[Expectation] = dataclasses.field(default_factory=list)
+    """Promised numbers."""
+
+    @property
+    def output_dir(self) -> Path:
+        """Folder of the run: `run_dir`, or one made of name, ablation and seed."""
+        name = f"{self.name}-{self.ablation}-s{self.seed}"
+        return Path(self.run_dir or f"runs/{name}")

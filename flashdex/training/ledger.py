@@ -1,0 +1,218 @@
+"""The ledger: one line an attempt, append-only, and the rollouts that passed."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flashdex.metrics.certificate import certify
+from flashdex.metrics.criteria import score
+from flashdex.training.attempts import Attempt
+
+CONVERSIONS = "conversions.jsonl"
+ROLLOUTS = "rollouts"
+
+
+@dataclass
+class Conversion:
+    """A motion's first passing attempt.
+
+    Attributes:
+        motion: name.
+        env_steps: counter when it passed.
+        wall_s: seconds since the run began.
+        certified: verdict of the certificate, None when none was asked for.
+    """
+
+    motion: str
+    env_steps: int
+    wall_s: float
+    certified: bool | None
+
+
+class Ledger:
+    """Judges attempts, writes a line for each, stores the first that passes.
+
+    A stored rollout is on disk, complete, before its line is written: a crash can lose
+    a line, never a conversion that has a line.
+
+    Args:
+        run_dir: run directory.
+        names: motions of the collection.
+        criterion: what counts as a conversion.
+        seed: of the run.
+        engine: physics engine of the rollouts.
+        certify: replay conversions and write the certificate.
+        trivial: motions that a baseline already passes.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        names: list[str],
+        *,
+        criterion: str,
+        seed: int,
+        engine: str,
+        certify: bool = True,
+        trivial: dict[str, list[str]] | None = None,
+    ) -> None:
+        self.path = run_dir / CONVERSIONS
+        self.rollouts = run_dir / ROLLOUTS
+        self.rollouts.mkdir(parents=True, exist_ok=True)
+        self.names, self.criterion, self.seed = names, criterion, seed
+        self.engine, self.certify, self.trivial = engine, certify, trivial or {}
+        self.conversions: dict[str, Conversion] = {}
+        self.last: dict[str, bool] = {}
+        self.attempts: dict[str, int] = dict.fromkeys(names, 0)
+        self.best: dict[str, dict[str, float]] = {}
+        self._read()
+
+    def _read(self) -> None:
+        """Take up the lines of an earlier session of the same run."""
+        for line in read_lines(self.path):
+            self._count(line)
+
+    def _count(self, line: dict[str, Any]) -> None:
+        name = line["motion"]
+        self.attempts[name] = self.attempts.get(name, 0) + 1
+        self.last[name] = line["converted"]
+        errors = line["errors"]
+        known = self.best.get(name)
+        if errors and (known is None or _total(errors) < _total(known)):
+            self.best[name] = errors
+        if line["converted"] and name not in self.conversions:
+            self.conversions[name] = Conversion(
+                name, line["env_steps"], line["wall_s"], line["certified"]
+            )
+
+    def record(
+        self, attempt: Attempt, *, env_steps: int, wall_s: float
+    ) -> Conversion | None:
+        """Judge one attempt and write its line.
+
+        Args:
+            attempt: finished episode.
+            env_steps: counter of the run.
+            wall_s: seconds since the run began, earlier sessions included.
+
+        Returns:
+            The conversion, if this attempt is the motion's first that passes.
+        """
+        rollout = attempt.rollout
+        verdicts = score(
+            rollout.signals(), grace=rollout.grace, completed=attempt.completed
+        )
+        verdict = verdicts[self.criterion]
+        converted = verdict.is_passed
+        name = rollout.motion
+        first = converted and name not in self.conversions
+        line: dict[str, Any] = {
+            "motion": name,
+            "converted": converted,
+            "certified": None,
+            "criterion": self.criterion,
+            "errors": {k: round(v, 6) for k, v in verdict.values.items()},
+            "passed": [k for k, v in verdicts.items() if v.is_passed],
+            "completed": attempt.completed,
+            "why": _why(attempt, verdict.reason, verdict.blame),
+            "frame": attempt.frame,
+            "env_steps": env_steps,
+            "wall_s": round(wall_s, 3),
+            "gpu_s": 0.0,
+            "seed": self.seed,
+            "engine": self.engine,
+            "trivial": self.trivial.get(name, []),
+        }
+        if first:
+            line.update(self._store(attempt, line))
+        self._append(line)
+        self._count(line)
+        return self.conversions[name] if first else None
+
+    def _store(self, attempt: Attempt, line: dict[str, Any]) -> dict[str, Any]:
+        rollout = attempt.rollout
+        rollout.errors = json.dumps(line["errors"])
+        path = self.rollouts / f"{rollout.motion}.npz"
+        rollout.save(path)
+        out: dict[str, Any] = {"rollout": f"{ROLLOUTS}/{path.name}"}
+        if self.certify:
+            certificate = certify(rollout)
+            text = json.dumps(certificate.to_dict(), indent=1)
+            write_atomic(path.with_suffix(".certificate.json"), text)
+            out["certified"] = certificate.verdict in ("certified", "robust")
+            out["verdict"] = certificate.verdict
+        return out
+
+    def _append(self, line: dict[str, Any]) -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    @property
+    def num_converted(self) -> int:
+        """Motions with at least one passing attempt."""
+        return len(self.conversions)
+
+    @property
+    def num_certified(self) -> int:
+        """Converted motions whose certificate holds."""
+        return sum(bool(c.certified) for c in self.conversions.values())
+
+    def metrics(self, gpu_hours: float) -> dict[str, float]:
+        """Counters of the ``convert/`` group."""
+        total = len(self.names)
+        passing = sum(self.last.get(n, False) for n in self.names)
+        out = {
+            "convert/cumulative": float(self.num_converted),
+            "convert/rate": self.num_converted / total,
+            "convert/last": passing / total,
+            "convert/certified": float(self.num_certified),
+            "convert/attempts": float(sum(self.attempts.values())),
+        }
+        if gpu_hours > 0:
+            out["convert/per_gpu_hour"] = self.num_converted / gpu_hours
+        return out
+
+
+def _total(errors: dict[str, float]) -> float:
+    """Position in metres plus rotation, 30 degrees counting as 3 cm."""
+    return errors.get("object_pos", 9.0) + errors.get("object_rot", 9.0) * 0.0573
+
+
+def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Causes of a failed attempt: what ended it, or which limit which hand crossed."""
+    if attempt.why:
+        return [dict(w) for w in attempt.why]
+    if blame:
+        return [
+            {"cause": b.term, "hand": b.side, "value": round(b.value, 5), "frame": b.frame}
+            for b in blame
+        ]
+    return [{"cause": reason}] if reason else []
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read a JSONL file; a last line cut off by a crash is left out."""
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines()
+    out = []
+    for number, line in enumerate(lines):
+        try:
+            out.append(json.loads(line))
+        except ValueError:
+            if number < len(lines) - 1:
+                raise
+    return out
+
+
+def write_atomic(path: Path, text: str) -> None:
+    """Write a text file so that a crash leaves the old one or the new one."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)

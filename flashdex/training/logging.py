@@ -1,0 +1,152 @@
+"""Metric writers: JSON lines are the truth, CSV and W&B are copies."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from flashdex.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from flashdex.recipe import Recipe
+
+METRICS = "metrics.jsonl"
+
+
+class MetricWriter(Protocol):
+    """Takes one record of metrics at a time."""
+
+    def write(self, record: dict[str, float]) -> None:
+        """Write one record; it always holds ``env_steps``."""
+        ...
+
+    def close(self) -> None:
+        """Finish."""
+        ...
+
+
+class JsonlWriter:
+    """Appends one JSON object a record to ``metrics.jsonl``.
+
+    Args:
+        run_dir: run directory.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._file = (run_dir / METRICS).open("a", encoding="utf-8")
+
+    def write(self, record: dict[str, float]) -> None:
+        """Append and flush."""
+        self._file.write(json.dumps(record) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class CsvWriter:
+    """Writes ``metrics.csv``; its columns are those of the first record.
+
+    Args:
+        run_dir: run directory.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._path = run_dir / "metrics.csv"
+        self._fields: list[str] | None = None
+        if self._path.is_file():
+            with self._path.open(encoding="utf-8") as file:
+                self._fields = next(csv.reader(file), None)
+
+    def write(self, record: dict[str, float]) -> None:
+        """Append one row."""
+        fresh = self._fields is None
+        self._fields = self._fields or list(record)
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._fields, extrasaction="ignore")
+            if fresh:
+                writer.writeheader()
+            writer.writerow(record)
+
+    def close(self) -> None:
+        """Every row is on disk already."""
+
+
+class WandbWriter:
+    """Weights & Biases, on its own axes: env steps and hours, never W&B's step.
+
+    Args:
+        run_dir: run directory; offline files go there.
+        recipe: names, tags and mode.
+        run_id: id of an earlier session of the same run.
+    """
+
+    def __init__(
+        self, run_dir: Path, recipe: Recipe, *, run_id: str | None = None
+    ) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise MissingExtraError("wandb", extra="wandb") from error
+        c = recipe.logger
+        self._run = wandb.init(
+            project=c.wandb_project,
+            entity=c.wandb_entity,
+            group=c.wandb_group or recipe.name,
+            name=f"{recipe.name}-{recipe.ablation}-s{recipe.seed}",
+            job_type="train",
+            tags=[recipe.hand, recipe.physics.engine, *c.wandb_tags],
+            mode=c.wandb_mode,
+            dir=str(run_dir),
+            id=run_id,
+            resume="allow" if run_id else None,
+            settings=wandb.Settings(console="off", silent=True),
+        )
+        self._run.define_metric("env_steps")
+        self._run.define_metric("hours")
+        self._run.define_metric("*", step_metric="env_steps")
+        self.run_id = self._run.id
+
+    def write(self, record: dict[str, float]) -> None:
+        """Log one record."""
+        self._run.log(record)
+
+    def close(self) -> None:
+        """Finish the run."""
+        self._run.finish()
+
+
+class MetricLog:
+    """Sends each record to all writers of the recipe.
+
+    Args:
+        run_dir: run directory.
+        recipe: names the writers.
+        wandb_id: id of an earlier session.
+    """
+
+    def __init__(
+        self, run_dir: Path, recipe: Recipe, *, wandb_id: str | None = None
+    ) -> None:
+        self.writers: list[MetricWriter] = [JsonlWriter(run_dir)]
+        self.wandb_id = wandb_id
+        if "csv" in recipe.logger.kind:
+            self.writers.append(CsvWriter(run_dir))
+        if "wandb" in recipe.logger.kind:
+            writer = WandbWriter(run_dir, recipe, run_id=wandb_id)
+            self.wandb_id = writer.run_id
+            self.writers.append(writer)
+
+    def write(self, record: dict[str, Any]) -> None:
+        """Write one record everywhere."""
+        clean = {k: float(v) for k, v in record.items()}
+        for writer in self.writers:
+            writer.write(clean)
+
+    def close(self) -> None:
+        """Close all writers."""
+        for writer in self.writers:
+            writer.close()

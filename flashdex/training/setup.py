@@ -1,0 +1,207 @@
+"""From a recipe to library, hands, environment and learner."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import hashlib
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from flashdex.envs.physics.cpu import CpuPhysics
+from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.envs.transforms.build import make_transforms
+from flashdex.errors import FlashdexError, LibraryError, MissingExtraError
+from flashdex.hands.spec import HandSpec, load_hand
+from flashdex.motions.library import MotionLibrary
+from flashdex.motions.prepare import prepare
+from flashdex.recipe import Recipe
+from flashdex.training.learner import Learner
+
+
+@dataclass(frozen=True)
+class Workbench:
+    """What every use of a recipe needs.
+
+    Attributes:
+        recipe: validated recipe.
+        library: prepared motions, selected ones only.
+        hands: hand specs by side.
+        bank: the library as tensors.
+    """
+
+    recipe: Recipe
+    library: MotionLibrary
+    hands: dict[str, HandSpec]
+    bank: ReferenceBank
+
+    @property
+    def step_dt(self) -> float:
+        """Control step, s."""
+        return self.recipe.physics.timestep * self.recipe.physics.decimation
+
+    def make_env(
+        self,
+        *,
+        num_envs: int | None = None,
+        seed: int | None = None,
+        evaluation: bool = False,
+    ) -> TrackingEnv:
+        """Build physics and environment.
+
+        Args:
+            num_envs: worlds; the recipe's number when None.
+            seed: of resets; the recipe's when None.
+            evaluation: no terminations, no noise, every world an attempt.
+        """
+        recipe = self.recipe
+        count = recipe.env.num_envs if num_envs is None else num_envs
+        if recipe.physics.engine != "cpu":
+            raise MissingExtraError(
+                f"physics engine '{recipe.physics.engine}'", extra=recipe.physics.engine
+            )
+        physics = CpuPhysics(self.library, self.hands, recipe.physics, count)
+        return TrackingEnv(
+            physics,
+            self.bank,
+            self.hands,
+            recipe.env,
+            step_dt=self.step_dt,
+            seed=recipe.seed if seed is None else seed,
+            evaluation=evaluation,
+        )
+
+    def make_learner(self, env: TrackingEnv) -> Learner:
+        """Build networks, loss and replay for an environment's states."""
+        recipe = self.recipe
+        transforms = make_transforms(
+            recipe.env.transforms,
+            self.bank,
+            self.hands,
+            reference_offset=recipe.env.reference_offset,
+        )
+        steps = recipe.total_env_steps / env.num_envs
+        return Learner(
+            recipe.algo,
+            transforms,
+            self.bank,
+            env.reset(),
+            total_updates=max(1, math.ceil(steps * recipe.algo.updates_per_step)),
+            seed=recipe.seed,
+        )
+
+
+def open_workbench(recipe: Recipe) -> Workbench:
+    """Load or prepare the motions of a recipe and check that they fit it.
+
+    Args:
+        recipe: validated recipe.
+
+    Raises:
+        LibraryError: the library is missing, of another hand or of another rate.
+    """
+    hands = load_hand(recipe.hand)
+    library = select_motions(_load_library(recipe), recipe)
+    if library.hand != recipe.hand:
+        raise LibraryError(
+            f"{library.path}: prepared for hand '{library.hand}', the recipe asks for "
+            f"'{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
+        )
+    step_dt = recipe.physics.timestep * recipe.physics.decimation
+    if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):
+        raise LibraryError(
+            f"{library.path}: {library.fps:g} frames a second, but physics.timestep x "
+            f"physics.decimation gives {1 / step_dt:g} control steps a second. Set "
+            f"physics.decimation={round(1 / (library.fps * recipe.physics.timestep))} "
+            f"or prepare with --hz {1 / step_dt:g}."
+        )
+    return Workbench(recipe, library, hands, ReferenceBank(library, hands))
+
+
+def _load_library(recipe: Recipe) -> MotionLibrary:
+    motions = recipe.motions
+    if motions.library is not None:
+        return MotionLibrary.load(motions.library)
+    if motions.source is None:
+        raise FlashdexError(
+            "motions: neither 'library' nor 'source' is set. Give motions.library=DIR "
+            "of a prepared library, or motions.source=procedural."
+        )
+    folder = Path("libraries") / _library_name(recipe)
+    if not (folder / "manifest.json").is_file():
+        prepare(
+            source=motions.source,
+            input=motions.input,
+            hand=recipe.hand,
+            out=folder,
+            control_hz=motions.control_hz,
+            limit=motions.count,
+            seed=motions.seed,
+        )
+    return MotionLibrary.load(folder)
+
+
+def _library_name(recipe: Recipe) -> str:
+    """Folder of an automatically prepared library: readable, and unique by content."""
+    motions = dataclasses.asdict(recipe.motions)
+    for key in ("library", "select"):
+        motions.pop(key)
+    text = json.dumps({**motions, "hand": recipe.hand}, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return f"{recipe.motions.source}-{recipe.hand}-{digest}"
+
+
+def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
+    """Keep the motions named by ``motions.select`` and ``motions.count``.
+
+    Frames are not copied: the rows of ``motions`` are chosen, their frames stay where
+    they are on the frame axis.
+    """
+    chosen = list(range(library.num_motions))
+    if recipe.motions.select is not None:
+        chosen = []
+        for pattern in recipe.motions.select:
+            rows = [
+                i
+                for i, name in enumerate(library.names)
+                if fnmatch.fnmatch(name, pattern)
+            ]
+            if not rows:
+                raise LibraryError(
+                    f"{library.path}: motions.select '{pattern}' matches none of "
+                    f"{', '.join(library.names)}."
+                )
+            chosen += [r for r in rows if r not in chosen]
+    if recipe.motions.count is not None:
+        chosen = chosen[: recipe.motions.count]
+    if len(chosen) == library.num_motions:
+        return library
+    return _take(library, chosen)
+
+
+def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
+    index = [
+        torch.arange(int(s), int(s) + int(n))
+        for s, n in zip(
+            library.motions["start"][rows].tolist(),
+            library.motions["length"][rows].tolist(),
+            strict=True,
+        )
+    ]
+    motions = library.motions[torch.tensor(rows)].clone()
+    length = motions["length"]
+    motions["start"] = torch.cumsum(length, 0) - length
+    manifest = dict(library.manifest)
+    manifest["motions"] = [library.manifest["motions"][r] for r in rows]
+    return MotionLibrary(
+        path=library.path,
+        frames=library.frames[torch.cat(index)],
+        motions=motions,
+        objects=library.objects,
+        manifest=manifest,
+    )

@@ -1,0 +1,133 @@
+"""Every limit at, below and above: signals are given, so that numbers are exact."""
+
+import math
+
+import pytest
+import torch
+
+from flashdex.errors import UnknownNameError
+from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.signals import Signals
+
+T, GRACE = 47, 15
+DEG = math.pi / 180
+
+
+def signals(**values):
+    """Both hands with an object each; the named signal takes one value on the right."""
+
+    def field(key, *shape):
+        table = torch.zeros(T, 2, *shape, dtype=torch.float64)
+        table[:, 1] = values.get(key, 0.0)
+        return table
+
+    offset = torch.zeros(T, 2, 3, dtype=torch.float64)
+    offset[:, 1, 0] = values.get("object_pos", 0.0)
+    sway = values.get("sway", 0.0)
+    offset[:, 1, 1] += sway * torch.tensor([(-1.0) ** t for t in range(T)])
+    ref = torch.zeros(T, 2, 3, dtype=torch.float64)
+    ref[:, :, 2] = torch.linspace(0, 0.5, T)[:, None]
+    return Signals(
+        object_pos_offset=offset,
+        object_rot_error=field("object_rot"),
+        ref_object_pos=ref,
+        fingertip_error=field("fingertip", 5),
+        joint_error=field("joint"),
+        wrist_pos_error=field("wrist_pos"),
+        hand_active=(True, True),
+        hand_object=(0, 1),
+        num_frames=T,
+        num_ref_frames=T,
+        fps=60.0,
+    )
+
+
+# criterion, signal, limit of one hand, whether the limit itself passes. Means over two
+# sides double what one side may do.
+CASES = [
+    *((n, "object_pos", 0.03, True) for n in ("sr_mt_obj", "sr_mt")),
+    *((n, "object_rot", 30 * DEG, True) for n in ("sr_mt_obj", "sr_mt")),
+    ("sr_mt", "fingertip", 0.06, True),
+    ("sr_mt", "joint", 0.08, True),
+    ("sr_mt_obj_x0.5", "object_pos", 0.015, True),
+    ("sr_mt_obj_x0.5", "object_rot", 15 * DEG, True),
+    ("sr_mt_obj_x2", "object_pos", 0.06, True),
+    ("sr_mt_obj_x2", "object_rot", 60 * DEG, True),
+    ("sr_mt_x0.5", "fingertip", 0.03, True),
+    ("sr_mt_x0.5", "joint", 0.04, True),
+    ("sr_mt_x2", "fingertip", 0.12, True),
+    ("sr_mt_x2", "joint", 0.16, True),
+    ("sr_loose", "object_pos", 0.10, True),
+    ("sr_loose", "object_rot", 30 * DEG, True),
+    ("sr_mt_obj_frame", "object_pos", 0.03, True),
+    ("sr_mt_frame", "fingertip", 0.06, True),
+    ("sr_mt_frame", "joint", 0.08, True),
+    ("sr_mt_obj_p95", "object_pos", 0.03, True),
+    ("sr_mt_obj_p95", "object_rot", 30 * DEG, True),
+    ("sr_mt_obj_flashchord", "object_pos", 0.03, False),
+    ("sr_spider_raw", "object_pos", 0.20, False),
+    ("sr_spider_raw", "object_rot", 1.0, False),
+    ("sr_spider_centred", "object_rot", 1.0, True),
+    ("sr_spider_flashchord", "object_pos", 0.20, True),
+    ("sr_spider_worst", "object_pos", 0.10, False),
+    ("sr_spider_worst", "object_rot", 0.5, False),
+    ("chord_sr", "wrist_pos", 0.15, True),
+    ("chord_sr", "object_pos", 0.10, True),
+    ("chord_sr", "object_rot", 0.5, True),
+]
+
+
+@pytest.mark.parametrize(("name", "key", "limit", "_"), CASES)
+def test_below_passes_and_above_fails(name, key, limit, _):
+    below, above = (
+        score(signals(**{key: limit * factor}))[name] for factor in (1 - 1e-6, 1 + 1e-6)
+    )
+    assert below.state == "passed"
+    assert above.state == "failed"
+    assert above.blamed_sides == ("right",)
+    assert {b.term for b in above.blame} == {key}
+    assert above.failing_frame >= above.grace or above.grace == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "limit", "passes"),
+    [
+        case
+        for case in CASES
+        # limits that a mean of equal numbers meets exactly
+        if case[1] in ("object_rot", "wrist_pos") and case[2] in (0.5, 1.0, 0.15)
+    ],
+)
+def test_the_limit_itself(name, key, limit, passes):
+    verdict = score(signals(**{key: limit}))[name]
+    assert verdict.is_passed is passes
+
+
+def test_centred_limit():
+    # a sway of +-a about zero has a centred error of about a; two sides halve it
+    for factor, state in ((0.98, "passed"), (1.02, "failed")):
+        verdict = score(signals(sway=0.20 * factor))["sr_spider_centred"]
+        assert verdict.state == state
+
+
+@pytest.mark.parametrize("frame", [GRACE - 1, GRACE, T - 1])
+def test_one_bad_frame_counts_from_the_grace_on(frame):
+    given = signals()
+    given.object_rot_error[frame, 0] = 1.0
+    verdict = score(given)["sr_mt_obj_frame"]
+    assert verdict.is_passed is (frame < GRACE)
+    if frame >= GRACE:
+        assert (verdict.failing_frame, verdict.blamed_sides) == (frame, ("left",))
+
+
+def test_result_carries_its_window():
+    verdict = score(signals(), grace=7)["sr_mt_obj_x2"]
+    assert (verdict.grace, verdict.num_scored, verdict.fps) == (7, T - 7, 60.0)
+    assert verdict.limits == {"object_pos": 0.06, "object_rot": pytest.approx(60 * DEG)}
+
+
+def test_names_resolve_and_unknown_names_are_explained():
+    assert resolve_criterion("sr_spider") == "sr_spider_centred"
+    assert resolve_criterion("sr_mt_obj_left") == "sr_mt_obj_left"
+    with pytest.raises(UnknownNameError, match="Did you mean 'sr_mt_obj'"):
+        resolve_criterion("sr_mt_objj")

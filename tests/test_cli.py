@@ -1,0 +1,108 @@
+"""The command: exit codes, messages on stderr, no traceback for a user's mistake."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import flashdex
+from flashdex.cli import main
+from flashdex.doctor import Finding, examine, format_report
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*argv):
+        try:
+            code = main(argv)
+        except SystemExit as stop:  # argparse's way out
+            code = stop.code
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        return code, captured.out, captured.err
+
+    return call
+
+
+def test_ls_shows_every_recipe_and_its_promise(run):
+    code, out, _ = run("ls")
+    assert code == 0
+    for path in (ROOT / "recipes").glob("*.yaml"):
+        assert path.stem in out
+    assert "convert/cumulative >= 40 at 300,000,000 env steps" in out
+
+
+def test_a_user_error_is_two_and_goes_to_stderr(run):
+    code, out, err = run("train", "quickstrat")
+    assert (code, out) == (2, "")
+    assert err.startswith("flashdex train: ")
+    assert "Did you mean 'quickstart'?" in err
+
+
+def test_debug_shows_the_traceback():
+    with pytest.raises(flashdex.errors.FlashdexError):
+        main(["train", "quickstrat", "--debug"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        ([], "required"),
+        (["trian"], "invalid choice"),
+        (["train"], "give a recipe"),
+        (["train", "quickstart", "--lr", "3"], "key=value, without dashes"),
+        (["ls", "something"], "unknown: something"),
+        (["train", "quickstart", "env.num_env=3"], "Did you mean 'num_envs'?"),
+        (["validate", "/nowhere/x.yaml"], "no such file"),
+    ],
+)
+def test_mistakes_exit_two(run, argv, expected):
+    code, _, err = run(*argv)
+    assert code == 2
+    assert expected in err
+
+
+def test_cfg_prints_a_complete_recipe_for_each_run(run):
+    code, out, _ = run("train", "quickstart", "-m", "seed=0,1", "--cfg", "job")
+    assert code == 0
+    found = list(yaml.safe_load_all(out))
+    assert [recipe["seed"] for recipe in found] == [0, 1]
+    assert found[0]["env"]["rewards"]["object_points"]["rho"] == 0.058
+
+
+def test_overrides_may_stand_behind_flags(run):
+    code, out, _ = run("train", "quickstart", "--cfg", "job", "seed=7", "hand=xhand")
+    assert code == 0
+    assert yaml.safe_load(out)["seed"] == 7
+
+
+def test_cp_then_validate(run, tmp_path):
+    code, out, _ = run("cp", "quickstart", str(tmp_path))
+    assert code == 0
+    copy = Path(out.strip())
+    assert copy == tmp_path / "quickstart.yaml"
+    assert run("validate", str(copy))[0] == 0
+    assert run("cp", "quickstart", str(tmp_path))[0] == 2  # never overwrites
+    copy.write_text(copy.read_text().replace("num_envs", "num_env"))
+    code, _, err = run("validate", str(tmp_path), "bench50_xhand")
+    assert code == 2
+    assert "env.num_env: unknown key" in err
+
+
+def test_doctor_looks_at_everything():
+    findings = examine()
+    subjects = {finding.what for finding in findings}
+    assert {"python", "cpu", "gpu", "graphics", "disk"} <= subjects
+    report = format_report([*findings, Finding("missing", "torch", "run: pip")])
+    assert report.count("MISSING") == 1 + sum(f.status == "missing" for f in findings)
+
+
+def test_versions_agree():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == flashdex.__version__
+    assert f"## [{flashdex.__version__}]" in (ROOT / "CHANGELOG.md").read_text()

@@ -96,11 +96,11 @@ def _add_recipe_verbs(
 
     verb = add("prepare", _prepare, "make a motion library from recordings")
     verb.add_argument("--source", required=True, help="reader of the recordings")
-    verb.add_argument("--input", type=Path, help="folder or file of recordings")
+    verb.add_argument("--input", type=Path, help="what the source reads")
     verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
     verb.add_argument("--out", type=Path, required=True, help="folder of the library")
     verb.add_argument("--hz", type=float, default=60.0, help="control rate, 1/s")
-    verb.add_argument("--workers", type=int, default=0, help="processes; 0 = all cores")
+    verb.add_argument("--workers", type=int, default=1, help="processes (%(default)s)")
     verb.add_argument("--limit", type=int, help="only the first N recordings")
     verb.add_argument("--seed", type=int, default=0)
 
@@ -169,7 +169,7 @@ def _prepare(args: argparse.Namespace) -> int:
         input=args.input,
         hand=args.hand,
         out=args.out,
-        hz=args.hz,
+        control_hz=args.hz,
         workers=args.workers,
         limit=args.limit,
         seed=args.seed,

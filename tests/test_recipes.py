@@ -192,6 +192,7 @@ def test_a_dumped_recipe_reads_back_equal(tmp_path):
     recipe = compose("bench50_xhand", ["ablation=no_points", "seed=3"])
     dump_recipe(recipe, tmp_path / "recipe.yaml")
     assert load_recipe(tmp_path / "recipe.yaml") == recipe
+    assert load_recipe(tmp_path / "recipe.yaml", ["seed=4"]).seed == 4
     assert compose(tmp_path / "recipe.yaml") == recipe
     assert validate(recipe) == recipe
 

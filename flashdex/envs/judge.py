@@ -148,7 +148,7 @@ class Judge:
             match name:
                 case "object_points":
                     points = rewards.rescale_points(
-                        self.bank.points[rows], self.bank.radius[rows], rho=o.rho or 0.0
+                        self.bank.points[rows], self.bank.radius[rows], rho=o.rho
                     )
                     error = rewards.object_points_error(
                         points, pos, quat, ref_pos, ref_quat, top_k=o.top_k
@@ -160,8 +160,8 @@ class Judge:
                         quat,
                         ref_pos,
                         ref_quat,
-                        beta_pos=o.pos_scale,
-                        beta_rot=o.rot_scale,
+                        beta_pos=o.beta_pos,
+                        beta_rot=o.beta_rot,
                     )
                 case "fingertip_distance":
                     distance, _ = fingertip_distance(
@@ -231,10 +231,10 @@ class Judge:
                         kin["link_linvel"],
                         state[keys.OBJECT_VEL],
                         state["bad"],
-                        max_link_speed=o.link_speed,
-                        max_joint_speed=o.joint_speed,
-                        max_object_speed=o.object_speed,
-                        max_object_spin=o.object_rot_speed,
+                        max_link_speed=o.max_link_speed,
+                        max_joint_speed=o.max_joint_speed,
+                        max_object_speed=o.max_object_speed,
+                        max_object_spin=o.max_object_spin,
                     )
                     out[name] = bad & active
         return out

@@ -2,8 +2,8 @@
 
 All scenes of a collection share one layout (same bodies, joints, geoms, sensors), so
 that worlds with different motions can be stepped side by side: a hand that takes no
-part is parked far away without contact, an empty object slot holds a grain without
-contact, unused convex parts are grains too. Meshes are written inline, so the XML text
+part is parked out of reach, an empty object slot holds a grain out of reach, and unused
+convex parts are grains inside the first one. Meshes are written inline, so the XML text
 alone rebuilds the very same model.
 """
 
@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 # Bit masks of method section 5: hands meet hands and objects, objects meet objects.
 HAND_BITS = (1, 1)
 OBJECT_BITS = (2, 3)
-PARK_X = {"left": -4.0, "right": 4.0}  # m, where a hand without a part waits
+PARKED = {"left": (-4.0, 0.0, 3.0), "right": (4.0, 0.0, 3.0)}  # m, idle hands
 _GRAIN = 1e-3  # m, radius of a geom that fills an unused place
+# m; with its mass centre off the origin a body is never "simple", so that all scenes
+# have the same inertia structure
+_OFFSET = 1e-5
 _SENSOR_DATA = 2 | 16  # bits of mjSENS_CONTACT: net force and position
 _NET_FORCE = 3  # reduction: one wrench at the force-weighted point, world axes
 
@@ -125,30 +128,40 @@ class Scene:
         return np.array(start)[:, None] + np.arange(6)
 
 
-def build_scene(
+def build_scenes(
+    library: MotionLibrary, hands: dict[str, HandSpec], physics: PhysicsConfig
+) -> list[Scene]:
+    """Build the scenes of all motions of a collection, of one layout.
+
+    Args:
+        library: the prepared collection.
+        hands: hand specs by side.
+        physics: time step, solver, gains, friction.
+    """
+    layout = SceneLayout.of(library)
+    specs = [
+        _make_spec(library, m, hands, physics, layout)
+        for m in range(library.num_motions)
+    ]
+    nodes = [spec.compile().nbvh for spec in specs]
+    for spec, count in zip(specs, nodes, strict=True):
+        _pad_bvh(spec, max(nodes) - count)
+        spec.compile()
+    return [Scene(spec.to_xml(), layout, hands) for spec in specs]
+
+
+def _make_spec(
     library: MotionLibrary,
     motion: int,
     hands: dict[str, HandSpec],
     physics: PhysicsConfig,
-    layout: SceneLayout | None = None,
-) -> Scene:
-    """Build the scene of one motion.
-
-    Args:
-        library: the prepared collection.
-        motion: row of the motion.
-        hands: hand specs by side.
-        physics: time step, solver, gains, friction.
-        layout: shared layout; the library's own when None.
-    """
-    layout = layout or SceneLayout.of(library)
+    layout: SceneLayout,
+) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     _set_options(spec, physics)
-    active = library.motions["hand_active"][motion].bool().tolist()
     for side in layout.sides:
         add_hand(spec, hands[side], gains=physics.gains, gravcomp=physics.gravcomp)
-        on = active[keys.SIDES.index(side)]
-        _set_hand_contacts(spec, side, friction=physics.friction if on else None)
+        _set_hand_friction(spec, side, physics.friction)
     rows = library.motions["object_index"][motion].tolist()
     for slot in range(layout.num_objects):
         _add_object(spec, library, rows[slot], slot, layout.num_parts[slot], physics)
@@ -159,8 +172,25 @@ def build_scene(
         slot = max(0, slots[keys.SIDES.index(side)])
         if layout.num_objects:
             _add_contact_sensors(spec, hands[side], slot)
-    spec.compile()
-    return Scene(spec.to_xml(), layout, hands)
+    return spec
+
+
+def _pad_bvh(spec: mujoco.MjSpec, nodes: int) -> None:
+    """Add unused meshes, so that the scene has ``nodes`` more bounding volumes.
+
+    A mesh of f faces has 2 f - 1 of them; their number is part of MuJoCo's data layout.
+    """
+    faces = [] if nodes == 0 else [(nodes + 1) // 2]
+    if nodes and nodes % 2 == 0:
+        faces = [1, nodes // 2]
+    for i, count in enumerate(faces):
+        step = np.arange(count + 3)
+        vertices = np.stack([step * 0.01, step % 2 * 0.01, step % 3 * 0.003], -1)
+        mesh = spec.add_mesh(name=f"filler{i}")
+        mesh.uservert = vertices.reshape(-1)
+        strip = np.arange(count)[:, None] + np.arange(3)
+        mesh.userface = strip.reshape(-1).astype(np.int32)
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
@@ -177,16 +207,9 @@ def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     spec.compiler.degree = False
 
 
-def _set_hand_contacts(
-    spec: mujoco.MjSpec, side: keys.Side, *, friction: float | None
-) -> None:
-    """Set the friction of a hand's geoms; None takes the hand out of all contacts."""
+def _set_hand_friction(spec: mujoco.MjSpec, side: keys.Side, friction: float) -> None:
     for geom in spec.geoms:
-        if not geom.parent.name.startswith(f"{side}_"):
-            continue
-        if friction is None:
-            geom.contype = geom.conaffinity = 0
-        else:
+        if geom.parent.name.startswith(f"{side}_"):
             geom.contype, geom.conaffinity = HAND_BITS
             geom.friction[0] = friction
 
@@ -207,12 +230,13 @@ def _add_object(
         objects = library.objects
         inertia = objects["inertia"][row].double().numpy()
         body.mass = float(objects["mass"][row])
-        body.ipos = objects["com"][row].double().numpy()
+        body.ipos = objects["com"][row].double().numpy() + _OFFSET
         order = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
         body.fullinertia = [inertia[i, j] for i, j in order]
     else:
         body.mass, body.inertia, body.gravcomp = 0.01, [1e-5] * 3, 1.0
-        body.ipos = [0.0, 0.0, 0.0]  # left unset, the XML loses the inertia
+        body.ipos = [_OFFSET] * 3
+    inside = parts[0].mean(0) if parts else np.zeros(3)
     for i in range(num_parts):
         name = f"object{slot}_part{i}"
         if i < len(parts):
@@ -227,28 +251,33 @@ def _add_object(
             geom.condim = physics.condim
             geom.rgba = [0.85, 0.55, 0.25, 1.0] if slot == 0 else [0.3, 0.6, 0.4, 1.0]
         else:
-            _add_grain(body, name)
+            _add_grain(body, name, inside, OBJECT_BITS)
 
 
-def _add_grain(body: mujoco.MjsBody, name: str) -> None:
-    """Fill an unused place of the layout with a geom that touches nothing."""
+def _add_grain(
+    body: mujoco.MjsBody, name: str, pos: np.ndarray, bits: tuple[int, int]
+) -> None:
+    """Fill an unused place of the layout with a geom that nothing reaches."""
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=[_GRAIN, 0, 0],
-        contype=0,
-        conaffinity=0,
+        pos=pos,
+        contype=bits[0],
+        conaffinity=bits[1],
     )
 
 
 def _add_supports(
     spec: mujoco.MjSpec, discs: object, layout: SceneLayout, physics: PhysicsConfig
 ) -> None:
+    # Objects meet the support (2 & 2); hands do only when the recipe says so.
+    bits = (1, 3) if physics.hand_support_contact else (0, 2)
     for i in range(layout.num_supports):
         x, y, top, radius, height = (float(v) for v in discs[i])  # type: ignore[index]
         name = f"support{i}"
         if not np.isfinite(top):
-            _add_grain(spec.worldbody, name)
+            _add_grain(spec.worldbody, name, np.array([0, 0, -20.0 - i]), bits)
             continue
         geom = spec.worldbody.add_geom(
             name=name,
@@ -257,9 +286,7 @@ def _add_supports(
             pos=[x, y, top - height / 2],
             rgba=[0.8, 0.8, 0.78, 1.0],
         )
-        # Objects meet the support (2 & 2); hands do only when the recipe says so.
-        geom.contype = 1 if physics.hand_support_contact else 0
-        geom.conaffinity = 3 if physics.hand_support_contact else 2
+        geom.contype, geom.conaffinity = bits
         geom.friction = [physics.support_friction, 0.05, 0.05]
 
 
@@ -282,5 +309,5 @@ def parked_joint_pos(hand: HandSpec) -> np.ndarray:
     pos = np.zeros(len(hand.joint_names))
     lower, upper = np.asarray(hand.joint_range).T
     pos[6:] = np.clip(0.0, lower[6:], upper[6:])
-    pos[0] = PARK_X[hand.side]
+    pos[:3] = PARKED[hand.side]
     return pos

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,6 +101,7 @@ class TrackingEnv(EnvBase):
         self.frame = torch.ones(n, dtype=torch.long)
         self.steps = torch.zeros(n, dtype=torch.long)
         self.forced_motion: Tensor | None = None
+        self.target_override: Callable[[TrackingEnv], Tensor] | None = None
         self._filter = torch.zeros(n, 2, 6)
         self._target = torch.zeros(n, 2, self.joint_range.shape[1])
         self.info: StepInfo | None = None
@@ -230,6 +232,8 @@ class TrackingEnv(EnvBase):
             wrist_scale=self._wrist_scale,
             finger_scale=self.config.finger_scale if residual else None,
         )
+        if self.target_override is not None:
+            self._target = self.target_override(self)
         self.physics.step(self._target, self._wrench(ref))
 
     def _wrench(self, ref: TensorDictBase) -> WrenchFn | None:

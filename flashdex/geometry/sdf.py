@@ -34,6 +34,7 @@ class SdfGrid(nn.Module):
     values: Tensor
     origin: Tensor
     spacing: Tensor
+    _offset: Tensor
 
     def __init__(self, values: Tensor, origin: Tensor, spacing: Tensor) -> None:
         super().__init__()

@@ -70,9 +70,13 @@ class Certificate:
     safety: dict[str, Any]
     provenance: dict[str, Any]
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; numbers that are not finite become None."""
+        return _finite(asdict(self))
+
     def to_json(self) -> str:
-        """JSON text; numbers that are not finite become null."""
-        return json.dumps(_finite(asdict(self)), indent=1, allow_nan=False)
+        """JSON text of :meth:`to_dict`."""
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False)
 
     def save(self, path: str | Path) -> Path:
         """Write the JSON in one piece.

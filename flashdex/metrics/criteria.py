@@ -68,8 +68,6 @@ def _object_sides(
 ) -> list[int]:
     """Hands whose object counts; some rules drop static references."""
     chosen = [h for h in sides if signals.slot(h) >= 0]
-    if criterion.once_per_object and len({signals.slot(h) for h in chosen}) == 1:
-        chosen = chosen[:1]
     if criterion.drop_static and signals.ref_object_pos is not None:
         drift = reference_drift(signals.ref_object_pos)
         chosen = [h for h in chosen if float(drift[signals.slot(h)]) >= STATIC_DRIFT]

@@ -60,7 +60,6 @@ class Criterion:
     family: Family
     grace: int
     drop_static: bool = False
-    once_per_object: bool = False
 
 
 def _maniptrans_terms(
@@ -90,9 +89,9 @@ def _maniptrans(limits: Limits, grace: int) -> Iterable[Criterion]:
     yield Criterion("sr_mt_obj_p95", terms, "mt", grace)
     loose = replace(limits, object_pos=limits.loose_pos)
     yield Criterion("sr_loose", _maniptrans_terms(loose, hand=False), "mt", grace)
-    # FlashCHORD's port: strict, whole clip, every object once
+    # FlashCHORD's port: strict, whole clip
     terms = _maniptrans_terms(limits, hand=False, strict=True)
-    yield Criterion("sr_mt_obj_flashchord", terms, "mt", 0, once_per_object=True)
+    yield Criterion("sr_mt_obj_flashchord", terms, "mt", 0)
 
 
 def _spider_terms(
@@ -112,8 +111,8 @@ def _spider(limits: Limits) -> Iterable[Criterion]:
     yield Criterion("sr_spider_centred", centred, "spider", 0, drop_static=True)
     yield Criterion("sr_spider_raw", raw, "spider", 0, drop_static=True)
     yield Criterion("sr_spider_worst", worst, "spider", 0, drop_static=True)
-    # FlashCHORD's evaluator: raw, <=, static objects counted, every object once
-    yield Criterion("sr_spider_flashchord", pooled, "spider", 0, once_per_object=True)
+    # FlashCHORD's evaluator: raw, <=, static objects counted
+    yield Criterion("sr_spider_flashchord", pooled, "spider", 0)
 
 
 def make_criteria(*, limits: Limits | None = None, grace: int = 15) -> list[Criterion]:

@@ -22,7 +22,15 @@ from flashdex.metrics.verdict import SIDES
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200
-OVERFLOWS = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL")
+# MuJoCo goes on after these, with contacts dropped or controls set to zero
+NUMERIC_WARNINGS = (
+    "mjWARN_CONTACTFULL",
+    "mjWARN_CNSTRFULL",
+    "mjWARN_BADCTRL",
+    "mjWARN_BADQPOS",
+    "mjWARN_BADQVEL",
+    "mjWARN_BADQACC",
+)
 
 StepMonitor = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
@@ -85,6 +93,20 @@ def load_scene(rollout: Rollout) -> Scene:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     _check_sizes(model, rollout)
     adr = np.asarray(rollout.object_qpos_adr, dtype=np.int64)
+    wrists = json.loads(rollout.wrist_bodies or "[null, null]")
+    active = rollout.hand_active.astype(bool)
+    named = [n if on else None for n, on in zip(wrists, active, strict=True)]
+    return Scene(
+        model=model,
+        object_body=np.array([_free_body(model, a, rollout.motion) for a in adr]),
+        object_adr=adr,
+        pad_sites=np.array([[_site(model, s, f) for f in FINGERS] for s in SIDES]),
+        joint_bodies=_joint_bodies(model, rollout),
+        wrist_bodies=np.array([_body(model, n, rollout.motion) for n in named]),
+    )
+
+
+def _joint_bodies(model: mujoco.MjModel, rollout: Rollout) -> np.ndarray:
     links = json.loads(rollout.joint_bodies)
     count = rollout.joints.shape[2]
     if len(links) != 2 or any(len(side) not in (0, count) for side in links):
@@ -92,20 +114,12 @@ def load_scene(rollout: Rollout) -> Scene:
             f"{rollout.motion}: joint_bodies must hold two lists (left, right) of "
             f"{count} body names, one a row of joints, or empty lists."
         )
-    wrists = json.loads(rollout.wrist_bodies or "[null, null]")
-    return Scene(
-        model=model,
-        object_body=np.array([_free_body(model, a, rollout.motion) for a in adr]),
-        object_adr=adr,
-        pad_sites=np.array([[_site(model, s, f) for f in FINGERS] for s in SIDES]),
-        joint_bodies=np.array(
-            [
-                [_body(model, n, rollout.motion) for n in side] or [-1] * count
-                for side in links
-            ]
-        ).reshape(2, count),
-        wrist_bodies=np.array([_body(model, n, rollout.motion) for n in wrists]),
-    )
+    bodies = np.full((2, count), -1)
+    # the model of a one-handed motion need not contain the other hand
+    for hand in np.flatnonzero(rollout.hand_active):
+        if links[hand]:
+            bodies[hand] = [_body(model, n, rollout.motion) for n in links[hand]]
+    return bodies
 
 
 def _check_sizes(model: mujoco.MjModel, rollout: Rollout) -> None:
@@ -158,7 +172,7 @@ def model_hash(model: mujoco.MjModel) -> str:
     return hashlib.sha256(buffer.tobytes()).hexdigest()
 
 
-def replay_points(scene: Scene, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+def replay_points(scene: Scene, qpos: np.ndarray) -> dict[str, np.ndarray]:
     """Fingertips, links and wrists at given joint positions, by forward kinematics.
 
     Args:
@@ -167,7 +181,7 @@ def replay_points(scene: Scene, qpos: np.ndarray) -> dict[str, np.ndarray | None
 
     Returns:
         ``fingertips`` (T, 2, 5, 3), ``joints`` (T, 2, M, 3), ``wrist_pos`` (T, 2, 3),
-        world, m; NaN for absent parts, None when both hands lack them.
+        world, m; NaN for absent parts.
     """
     data = mujoco.MjData(scene.model)
     rows: dict[str, list[np.ndarray]] = {
@@ -181,13 +195,10 @@ def replay_points(scene: Scene, qpos: np.ndarray) -> dict[str, np.ndarray | None
         rows["fingertips"].append(data.site_xpos[scene.pad_sites])
         rows["joints"].append(data.xpos[scene.joint_bodies])
         rows["wrist_pos"].append(data.xpos[scene.wrist_bodies])
-    masks = (scene.pad_sites, scene.joint_bodies, scene.wrist_bodies)
-    points: dict[str, np.ndarray | None] = {}
-    for (key, values), index in zip(rows.items(), masks, strict=True):
-        absent = index < 0
-        stacked = np.stack(values)
-        stacked[:, absent] = np.nan
-        points[key] = None if absent.all() else stacked
+    parts = scene.pad_sites, scene.joint_bodies, scene.wrist_bodies
+    points = {key: np.stack(values) for key, values in rows.items()}
+    for value, index in zip(points.values(), parts, strict=True):
+        value[:, index < 0] = np.nan
     return points
 
 
@@ -209,15 +220,17 @@ def replay_signals(
         scene: model and addresses.
         rollout: reference and masks.
         qpos: (T, nq).
-        overflow: the engine dropped contacts or constraints.
+        overflow: the engine warned of numerics.
     """
-    data: dict[str, np.ndarray | None] = dict(replay_points(scene, qpos))
-    # a hand without its links must not score NaN: it is a hole of the file
-    for hand in np.flatnonzero(rollout.hand_active):
-        for key in ("fingertips", "joints", "wrist_pos"):
-            value = data[key]
-            if value is not None and np.isnan(value[:, hand]).all():
-                data[key] = None
+    parts = scene.pad_sites, scene.joint_bodies, scene.wrist_bodies
+    active = np.flatnonzero(rollout.hand_active)
+    # a part that the model lacks is a hole of the file, not a failure
+    data: dict[str, np.ndarray | None] = {
+        key: None if (index[active] < 0).any() else points
+        for (key, points), index in zip(
+            replay_points(scene, qpos).items(), parts, strict=True
+        )
+    }
     data["object_pos"], data["object_quat"] = _object_poses(scene, qpos)
     for key in ("object_pos", "object_quat", "fingertips", "joints", "wrist_pos"):
         data[f"ref_{key}"] = getattr(rollout, f"ref_{key}")
@@ -270,7 +283,7 @@ def resimulate(
         applied = max(np.abs(data.xfrc_applied).max(), np.abs(data.qfrc_applied).max())
         wrench_max = max(wrench_max, float(applied))
     warnings = _warnings(data)
-    overflow = any(warnings[name] for name in OVERFLOWS) or nan_count > 0
+    overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
     signals = replay_signals(scene, rollout, qpos, overflow=overflow)
     return Replay(qpos, signals, warnings, nan_count, wrench_max)
 

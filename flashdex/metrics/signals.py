@@ -91,8 +91,8 @@ def align_to_reference(
         Row indices, (K,), K <= num_ref: reference rows the rollout has reached.
     """
     steps = torch.arange(first_step, num_ref + first_step, dtype=torch.float64)
-    # the small number keeps exact multiples from falling to the sample before
-    rows = torch.floor(steps * (fps / ref_fps) + 1e-9).long() - first_step
+    # multiply first: the quotient of an exact multiple is exact, nothing falls short
+    rows = torch.floor(steps * fps / ref_fps).long() - first_step
     return rows[(rows >= 0) & (rows < num_frames)]
 
 

@@ -10,7 +10,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from flashdex.errors import DemoError
-from flashdex.motions.contacts import NO_OBJECT, assign_object, contact_runs, tip_distances
+from flashdex.motions.contacts import (
+    NO_OBJECT,
+    assign_object,
+    contact_runs,
+    tip_distances,
+)
 from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.meshes import load_mesh
@@ -147,7 +152,9 @@ def _assign(
     tip_dist = np.full((len(keypoints), 2, 5), NO_OBJECT)
     for hand in np.flatnonzero(present):
         side = SIDES[hand]
-        fixed = [demo.hand_object[side]] if side in demo.hand_object else range(len(poses))
+        fixed = (
+            [demo.hand_object[side]] if side in demo.hand_object else range(len(poses))
+        )
         near = [tip_distances(keypoints[:, hand], poses[i], meshes[i]) for i in fixed]
         best = assign_object(near)
         chosen[int(hand)] = fixed[best]

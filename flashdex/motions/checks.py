@@ -1,7 +1,6 @@
 """Quality of a motion: findings with codes, and the figures of its report row.
 
-Codes and limits follow the list of the data pages; a rejected motion leaves the library,
-a flagged one stays and is reported.
+A rejected motion stays out of the library; a flagged one is in it and is reported.
 """
 
 from __future__ import annotations
@@ -51,7 +50,9 @@ class Finding:
 def status_of(findings: list[Finding]) -> Status:
     """Kept, flagged (a warning) or rejected."""
     levels = {f.level for f in findings}
-    return "rejected" if "reject" in levels else "flagged" if "warn" in levels else "kept"
+    return (
+        "rejected" if "reject" in levels else "flagged" if "warn" in levels else "kept"
+    )
 
 
 def check_demo(demo: HumanDemo) -> list[Finding]:
@@ -82,7 +83,9 @@ def _jumps(demo: HumanDemo) -> list[int]:
     for pose in tracks:
         step = np.linalg.norm(np.diff(pose[:, :3], axis=0), axis=-1)
         turn = (rotation(pose[1:, 3:]) * rotation(pose[:-1, 3:]).inv()).magnitude()
-        usual = np.array([np.median(step[max(i - 7, 0) : i + 8]) for i in range(len(step))])
+        usual = np.array(
+            [np.median(step[max(i - 7, 0) : i + 8]) for i in range(len(step))]
+        )
         bad |= (step * demo.fps > JUMP_SPEED) | (turn * demo.fps > JUMP_TURN)
         bad |= (step > JUMP_RATIO * usual) & (step > JUMP_STEP)
     return np.flatnonzero(bad).tolist()
@@ -141,7 +144,9 @@ def _check_meshes(assets: list[ObjectAsset]) -> list[Finding]:
             text = f"'{asset.name}' is {size:.3g} m large; are these metres?"
             found.append(_reject("E_UNIT", text))
         if not asset.watertight:
-            found.append(Finding("W_WATER", "info", f"'{asset.name}' is not watertight"))
+            found.append(
+                Finding("W_WATER", "info", f"'{asset.name}' is not watertight")
+            )
     return found
 
 

@@ -50,7 +50,7 @@ def assign_object(distances: list[np.ndarray]) -> int:
 
 
 def contact_runs(distances: np.ndarray, fps: float) -> np.ndarray:
-    """Fingers in contact: below 15 mm, gaps closed, short touches dropped; (T, 5) bool."""
+    """Fingers in contact, (T, 5): below 15 mm, gaps closed, short touches dropped."""
     mask = distances < CONTACT_DISTANCE
     size = max(int(CLOSE_SECONDS * fps), 1)
     out = np.zeros_like(mask)

@@ -16,6 +16,7 @@ logger = logging.getLogger(__name__)
 
 CONVEX_TOLERANCE = 0.01  # a mesh this close to its hull's volume is its own part
 MIN_PART_VOLUME = 1e-5  # share of the hull; slivers below it only slow contacts down
+SEARCH_ITERATIONS = 60  # of CoACD's tree search; 150 takes twice as long and cuts alike
 INERTIA_SLACK = 1e-6  # of the largest moment, added to all three
 
 
@@ -62,7 +63,7 @@ def compute_convex_parts(
     if not hulls:
         hulls = [(whole.volume, np.asarray(whole.vertices))]
     hulls.sort(key=lambda item: -item[0])
-    return [np.float32(_reduce_hull(v, max_vertices)) for _, v in hulls]
+    return [_reduce_hull(v, max_vertices).astype(np.float32) for _, v in hulls]
 
 
 def _run_coacd(
@@ -76,6 +77,7 @@ def _run_coacd(
             coacd.Mesh(mesh.vertices, mesh.faces),
             threshold=threshold,
             max_convex_hull=max_parts,
+            mcts_iterations=SEARCH_ITERATIONS,
             seed=seed,
         )
     except (RuntimeError, OSError) as error:

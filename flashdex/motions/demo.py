@@ -83,7 +83,9 @@ class HumanDemo:
             DemoError: names the motion, the track and the first frame at fault.
         """
         if not self.keypoints:
-            raise DemoError(f"{self.name}: no hand. Give keypoints for 'left', 'right'.")
+            raise DemoError(
+                f"{self.name}: no hand. Give keypoints for 'left', 'right'."
+            )
         if not self.objects:
             raise DemoError(f"{self.name}: no object. Give a mesh and its poses.")
         if not np.isfinite(self.fps) or self.fps <= 0:
@@ -172,7 +174,9 @@ class HumanDemo:
             fps=self.fps,
             keypoints={s: k[start:end] for s, k in self.keypoints.items()},
             palm={s: p[start:end] for s, p in self.palm.items()},
-            objects=[DemoObject(b.name, b.mesh, b.pose[start:end]) for b in self.objects],
+            objects=[
+                DemoObject(b.name, b.mesh, b.pose[start:end]) for b in self.objects
+            ],
             hand_object=dict(self.hand_object),
             source=self.source,
             licence=self.licence,

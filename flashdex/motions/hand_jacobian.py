@@ -11,11 +11,11 @@ from torch import Tensor
 from flashdex.geometry.rotation import quat_from_axis_angle, quat_rotate
 from flashdex.hands.spec import SIDES, HandSpec, Side
 
-NUM_WRIST = 6
+NUM_WRIST, NUM_SLIDES = 6, 3
 
 
 class JointFrames:
-    """World axes and anchors of all joints, (T, 2, J, 3).
+    """World axes and anchors of all joints, (T, 2, J, 3), and what they do to points.
 
     Args:
         axis: unit, world.
@@ -33,24 +33,45 @@ class JointFrames:
         link_quat: Tensor,
         moves: Tensor,
     ) -> None:
-        self.axis, self.anchor, self.moves = axis, anchor, moves
+        self.axis, self.moves = axis, moves
+        hinge = torch.ones(axis.shape[-2], 1, dtype=axis.dtype)
+        hinge[:NUM_SLIDES] = 0.0
+        slide = (1 - hinge) * axis
+        shift = torch.linalg.cross(hinge * axis, anchor) - slide
+        self._turn, self._shift = (hinge * axis).mT.contiguous(), shift.mT.contiguous()
         self._pos, self._quat = link_pos, link_quat
 
-    def points(self, link: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
-        """World position (T, 2, P, 3) and Jacobian (T, 2, P, 3, J) of points on links.
-
-        A slide moves a point by its axis; a hinge by a x (p - anchor).
+    def points(self, link: Tensor, local: Tensor) -> Tensor:
+        """World positions of points on links, m, (T, 2, P, 3).
 
         Args:
             link: of each point, (P,).
             local: in the link's frame, m, (2, P, 3).
         """
-        world = self._pos[..., link, :] + quat_rotate(self._quat[..., link, :], local)
-        arm = world[..., None, :] - self.anchor[..., None, :, :]
-        columns = torch.linalg.cross(self.axis[..., None, :, :].expand_as(arm), arm)
-        columns[..., :3, :] = self.axis[..., None, :3, :]
-        columns = columns * self.moves[link][..., None]
-        return world, columns.transpose(-1, -2)
+        return self._pos[..., link, :] + quat_rotate(self._quat[..., link, :], local)
+
+    def along(self, world: Tensor, direction: Tensor, link: Tensor) -> Tensor:
+        """How fast points move along given directions, per joint, (T, 2, P, J).
+
+        A slide moves a point by its axis, a hinge by a x (p - c); the latter along n is
+        a . (p x n) - (a x c) . n, two matrix products for all points and joints.
+
+        Args:
+            world: points, m, (T, 2, P, 3).
+            direction: n, world, (T, 2, P, 3).
+            link: of each point, (P,).
+        """
+        moment = torch.linalg.cross(world, direction)
+        columns = moment @ self._turn - direction @ self._shift
+        return columns * self.moves[link]
+
+    def full(self, world: Tensor, link: Tensor) -> Tensor:
+        """Jacobian of points, rows x, y, z, (T, 2, P, 3, J)."""
+        rows = [
+            self.along(world, axis.expand_as(world), link)
+            for axis in torch.eye(3, dtype=world.dtype)
+        ]
+        return torch.stack(rows, dim=-2)
 
 
 class HandJacobian:

@@ -64,7 +64,9 @@ def _spheres_of(
         body = mujoco.mj_id2name(
             model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])
         )
-        local, radius = _fill(int(model.geom_type[geom]), model.geom_size[geom], like[geom])
+        local, radius = _fill(
+            int(model.geom_type[geom]), model.geom_size[geom], like[geom]
+        )
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
         points = local @ matrix.reshape(3, 3).T + model.geom_pos[geom]
@@ -75,7 +77,7 @@ def _spheres_of(
 
 
 def _fill(kind: int, size: np.ndarray, like: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centres (K, 3) and radius of spheres that fill a geom, as many as ``like`` needs."""
+    """Centres (K, 3) and radius of spheres in a geom, as many as ``like`` needs."""
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return np.zeros((1, 3)), float(size[0])
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:

@@ -83,7 +83,7 @@ class MotionLibrary:
         return library
 
     def _check(self) -> None:
-        missing = [k for k in FRAME_KEYS if k not in self.frames.keys()]
+        missing = sorted(set(FRAME_KEYS) - set(self.frames.keys()))
         if missing:
             raise LibraryError(f"{self.path}: frames lack {', '.join(missing)}.")
         total = int(self.motions["length"].sum())

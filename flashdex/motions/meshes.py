@@ -68,6 +68,7 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     _drop_loose_components(mesh)
     mesh.remove_unreferenced_vertices()
+    _refuse_flat(mesh, name)
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
         trimesh.repair.fix_inversion(mesh, multibody=True)
@@ -75,7 +76,6 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
         trimesh.repair.fill_holes(mesh)
     if mesh.volume < 0:
         mesh.invert()
-    _refuse_flat(mesh, name)
     return mesh
 
 
@@ -99,7 +99,8 @@ def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
 
 def _refuse_flat(mesh: trimesh.Trimesh, name: str) -> None:
     try:
-        volume = float(mesh.convex_hull.volume) if len(mesh.faces) else 0.0
+        with np.errstate(all="ignore"):  # a flat hull divides by its volume
+            volume = float(mesh.convex_hull.volume) if len(mesh.faces) else 0.0
     except QhullError:
         volume = 0.0
     # Below this share of the cube around it, it is a sheet and not a thin solid.
@@ -170,9 +171,9 @@ def sample_surface_points(
     Returns:
         Points, m, (P, 3), and unit normals of their triangles, (P, 3).
     """
-    dense, face = trimesh.sample.sample_surface(
-        mesh, SAMPLES_PER_POINT * count, seed=seed
-    )
-    order = farthest_point_sampling(torch.from_numpy(np.asarray(dense)), count).numpy()
+    count_dense = SAMPLES_PER_POINT * count
+    dense, face, *_ = trimesh.sample.sample_surface(mesh, count_dense, seed=seed)
+    dense = np.asarray(dense)
+    order = farthest_point_sampling(torch.from_numpy(dense), count).numpy()
     normals = mesh.face_normals[face[order]]
-    return np.float32(dense[order]), np.float32(normals)
+    return dense[order].astype(np.float32), normals.astype(np.float32)

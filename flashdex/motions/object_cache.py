@@ -27,7 +27,7 @@ def write_cache(file: Path, values: Values) -> None:
         file: where; its directory is made.
         values: arrays, numbers, and ``parts``, a list of (V, 3) arrays.
     """
-    arrays = {k: np.asarray(v) for k, v in values.items() if k != "parts"}
+    arrays: Values = {k: np.asarray(v) for k, v in values.items() if k != "parts"}
     arrays["part_vertices"] = np.concatenate(values["parts"])
     arrays["part_sizes"] = np.array([len(p) for p in values["parts"]])
     try:

@@ -16,7 +16,7 @@ TABLE = "table"
 
 @dataclass
 class Penetration:
-    """Depth of the deepest contact of each frame, m, zero without contact, (T,) each."""
+    """Depth of the deepest contact of each frame, m, zero without one, (T,) each."""
 
     objects: np.ndarray
     table: np.ndarray
@@ -88,6 +88,8 @@ def measure_penetration(
 def _owners(model: mujoco.MjModel) -> np.ndarray:
     """0 and 1 for geoms of the left and right hand, 2 for objects, 3 for the table."""
     names = [model.body(int(b)).name for b in model.geom_bodyid]
-    owners = [0 if n.startswith("left_") else 1 if n.startswith("right_") else 2
-              for n in names]
+    owners = [
+        0 if n.startswith("left_") else 1 if n.startswith("right_") else 2
+        for n in names
+    ]
     return np.where(model.geom_bodyid == 0, 3, owners)

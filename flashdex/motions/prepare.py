@@ -32,7 +32,7 @@ PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
 def prepare(
     source: str,
-    input: str | Path | None = None,  # noqa: A002
+    input: str | Path | None = None,
     hand: str = "xhand",
     out: str | Path = "library",
     *,
@@ -83,7 +83,9 @@ def prepare(
         cache_dir=cache_dir,
     )
     hidden = None if progress is None else not progress
-    bar = tqdm(_run(demos, settings, workers), total=len(demos), disable=hidden, unit="motion")
+    bar = tqdm(
+        _run(demos, settings, workers), total=len(demos), disable=hidden, unit="motion"
+    )
     prepared = list(bar)
     manifest = {
         "source": source,
@@ -100,7 +102,9 @@ def prepare(
         if item.record is not None:
             writer.add(item.record)
     _refuse_empty(prepared, out)
-    return MotionLibrary.load(writer.write(report=make_report([p.row for p in prepared])))
+    return MotionLibrary.load(
+        writer.write(report=make_report([p.row for p in prepared]))
+    )
 
 
 def _run(

@@ -11,19 +11,24 @@ import torch
 
 from flashdex.errors import DemoError, MeshError
 from flashdex.geometry.rotation import quat_mul, quat_rotate
-from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.spec import load_hand
 from flashdex.motions.align import AlignedDemo, align
-from flashdex.motions.checks import Finding, check_aligned, check_demo, check_retarget
-from flashdex.motions.checks import status_of
+from flashdex.motions.checks import (
+    Finding,
+    check_aligned,
+    check_demo,
+    check_retarget,
+    status_of,
+)
 from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
+from flashdex.motions.objects import ObjectSettings, make_object
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.residuals import RetargetWeights, Targets
 from flashdex.motions.retarget import Retargeter
+from flashdex.motions.solid import make_slot_grid
 from flashdex.motions.support import support_disks
 from flashdex.motions.tracks import angular_velocity, linear_velocity
 
@@ -93,7 +98,7 @@ def _prepare(
         make_object(m, settings=settings.objects, cache_dir=settings.cache_dir, name=n)
         for m, n in zip(aligned.meshes, aligned.object_names, strict=True)
     ]
-    sdf = make_slot_grid(assets)
+    sdf = make_slot_grid(assets, solid=False)
     early, figures = check_aligned(aligned, assets, sdf)
     findings += early
     row |= figures
@@ -102,7 +107,7 @@ def _prepare(
     specs = load_hand(settings.hand)
     retargeter = Retargeter(specs, weights=settings.weights)
     targets = make_targets(aligned, retargeter)
-    result = retargeter.solve(targets, sdf)
+    result = retargeter.solve(targets, make_slot_grid(assets, solid=True))
     joint_pos = _park(result.joint_pos, aligned.active)
     scene = make_reference_scene(specs, [a.parts for a in assets])
     depth = measure_penetration(scene, joint_pos, aligned.poses, active=aligned.active)
@@ -128,15 +133,6 @@ def _prepare(
     )
 
 
-def make_slot_grid(assets: list[ObjectAsset]) -> SdfGrid:
-    """Distance grids of a motion's objects in float64, row = slot."""
-    return SdfGrid(
-        torch.tensor(np.stack([a.sdf for a in assets])).double(),
-        torch.tensor(np.stack([a.sdf_origin for a in assets])).double(),
-        torch.tensor([float(a.sdf_spacing) for a in assets]).double(),
-    )
-
-
 def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
     """What the robot hands should reach in every frame.
 
@@ -144,8 +140,9 @@ def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
     robot's palm is longer than a human's.
     """
     palm = torch.tensor(aligned.palm)
-    wrist_quat = quat_mul(palm[..., 3:], retargeter.hand.wrist_from_palm.expand_as(
-        palm[..., 3:]))
+    wrist_quat = quat_mul(
+        palm[..., 3:], retargeter.hand.wrist_from_palm.expand_as(palm[..., 3:])
+    )
     keypoints = torch.tensor(aligned.keypoints)
     arm = quat_rotate(wrist_quat, retargeter.hand.knuckle.expand(*palm.shape[:-1], 3))
     poses = torch.tensor(np.stack(aligned.poses, axis=1))

@@ -117,19 +117,23 @@ class Residuals:
             frames: joint axes of that pose.
             contact: whether contact and penetration count.
         """
+        spheres = frames.points(self.hand.spheres.link, self.hand.spheres.pos)
         parts = [
             self._tips(frames, contact=contact),
             self._wrist_pos(pose, q.shape[-1]),
             self._wrist_rot(pose, frames),
             *self._diagonal(q),
-            self._table(frames),
+            self._table(frames, spheres),
         ]
         if contact:
-            parts += [self._surface(frames), self._pads(frames), *self._clear(frames)]
+            parts += [self._surface(frames), self._pads(frames)]
+            parts += self._clear(frames, spheres)
         return parts
 
     def _tips(self, frames: JointFrames, *, contact: bool) -> Part:
-        world, jac = frames.points(self.hand.tip_link, self.hand.tip_pos)
+        link = self.hand.tip_link
+        world = frames.points(link, self.hand.tip_pos)
+        jac = frames.full(world, link)
         strict, loose = 1 / self.weights.tip, 1 / self.weights.tip_contact
         share = self.targets.contact if contact else 0 * self.targets.contact
         scale = (strict + share * (loose - strict))[..., None]
@@ -161,30 +165,35 @@ class Residuals:
             (steady * (q - smooth), torch.diag_embed(steady)),
         ]
 
-    def _table(self, frames: JointFrames) -> Part:
+    def _table(self, frames: JointFrames, world: Tensor) -> Part:
         spheres = self.hand.spheres
-        world, jac = frames.points(spheres.link, spheres.pos)
         depth = spheres.radius + self.weights.table - world[..., 2]
         hit = (depth > 0).to(depth.dtype) / self.weights.clear
-        return hit * depth, -hit[..., None] * jac[..., 2, :]
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=world.dtype).expand_as(world)
+        return hit * depth, -hit[..., None] * frames.along(world, up, spheres.link)
 
     def _surface(self, frames: JointFrames) -> Part:
-        world, jac = frames.points(self.hand.tip_link, self.hand.tip_center)
-        distance, slope = self._query(world, self.targets.hand_object)
+        """End spheres of touching fingers at the wanted depth."""
         scale = self.targets.contact / self.weights.surface
-        residual = scale * (distance - self._center_gap)
-        return residual, scale[..., None] * _project(slope, jac)
+        return self._touch(frames, self.hand.tip_center, self._center_gap, scale)
 
     def _pads(self, frames: JointFrames) -> Part:
-        world, jac = frames.points(self.hand.tip_link, self.hand.tip_pos)
-        distance, slope = self._query(world, self.targets.hand_object)
+        """Pad points of touching fingers on the surface: turns the pads to it."""
         scale = self.targets.contact / self.weights.pad
-        return scale * distance, scale[..., None] * _project(slope, jac)
+        return self._touch(frames, self.hand.tip_pos, torch.zeros(()), scale)
 
-    def _clear(self, frames: JointFrames) -> list[Part]:
-        """Penetration of every sphere into every object; touching tips may, a little."""
+    def _touch(
+        self, frames: JointFrames, local: Tensor, gap: Tensor, scale: Tensor
+    ) -> Part:
+        link = self.hand.tip_link
+        world = frames.points(link, local)
+        distance, slope = self._query(world, self.targets.hand_object)
+        jac = frames.along(world, slope, link)
+        return scale * (distance - gap), scale[..., None] * jac
+
+    def _clear(self, frames: JointFrames, world: Tensor) -> list[Part]:
+        """Penetration of all spheres into all objects; touching tips may, a little."""
         spheres, weights = self.hand.spheres, self.weights
-        world, jac = frames.points(spheres.link, spheres.pos)
         touch = self.targets.contact[..., spheres.distal.clamp_min(0)]
         touch = torch.where(spheres.distal >= 0, touch, 0.0)
         gap = spheres.radius + weights.margin - touch * (weights.margin + weights.depth)
@@ -193,7 +202,8 @@ class Residuals:
             distance, slope = self._query(world, torch.full((2,), slot))
             depth = gap - distance
             hit = (depth > 0).to(depth.dtype) / weights.clear
-            parts.append((hit * depth, -hit[..., None] * _project(slope, jac)))
+            jac = frames.along(world, slope, spheres.link)
+            parts.append((hit * depth, -hit[..., None] * jac))
         return parts
 
     def _query(self, world: Tensor, slot: Tensor) -> tuple[Tensor, Tensor]:
@@ -204,8 +214,3 @@ class Residuals:
         local = quat_rotate_inverse(quat.expand(*world.shape[:-1], 4), world - pos)
         distance, slope = self.sdf.query(local, slot[:, None])
         return distance, quat_rotate(quat.expand(*world.shape[:-1], 4), slope)
-
-
-def _project(slope: Tensor, jac: Tensor) -> Tensor:
-    """Jacobian of a distance: gradient times the point's Jacobian, (T, 2, P, J)."""
-    return torch.einsum("thpi,thpij->thpj", slope, jac)

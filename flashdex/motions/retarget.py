@@ -95,7 +95,9 @@ class Retargeter:
             slope += torch.einsum("thr,thrj->thj", residual, jac)
             curvature += jac.transpose(-1, -2) @ jac
         # a joint at its limit that is pushed outwards takes no part in the step
-        out = ((q <= self.hand.low) & (slope > 0)) | ((q >= self.hand.high) & (slope < 0))
+        out = ((q <= self.hand.low) & (slope > 0)) | (
+            (q >= self.hand.high) & (slope < 0)
+        )
         slope = torch.where(out, 0.0, slope)
         curvature = torch.where(out[..., None] | out[..., None, :], 0.0, curvature)
         curvature += torch.diag_embed(out.to(q.dtype))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import label
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
@@ -86,7 +87,7 @@ def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Ar
     faces = mesh.faces[area > 1e-12 * area.max()]
     frames = _triangle_frames(mesh.vertices[faces])
     samples, first, owners, cover = _surface_samples(mesh.vertices, faces, step)
-    tree = cKDTree(samples)
+    tree = KDTree(samples)
     best = np.full(len(points), np.inf)
     proven = np.zeros(len(points), dtype=bool)
     for k in NEIGHBOURS:
@@ -94,7 +95,7 @@ def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Ar
         todo = np.flatnonzero(~proven)
         for start in range(0, len(todo), NODE_CHUNK):
             part = todo[start : start + NODE_CHUNK]
-            reach, sample = tree.query(points[part], k=[*range(1, k + 1)])
+            reach, sample = map(np.asarray, tree.query(points[part], k=k))
             best[part] = _best_of(points[part], sample, first, owners, frames)
             proven[part] = reach[:, -1] ** 2 >= best[part] ** 2 + cover**2
     return best
@@ -142,7 +143,7 @@ def _inside_by_component(
     # Two neighbouring nodes that are both farther than half a spacing from the surface
     # lie on the same side of it, so one winding number serves a connected region.
     far = distance > 0.5001 * spacing
-    regions, count = label(far)
+    regions, count = cast(tuple[NDArray[np.int32], int], label(far))
     inside = np.zeros(distance.shape, dtype=bool)
     inside[~far] = winding_number(triangles, nodes[~far]) > 0.5
     order = np.argsort(distance, axis=None)

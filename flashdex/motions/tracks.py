@@ -79,7 +79,7 @@ def resample_pose(pose: np.ndarray, fps: float, times: np.ndarray) -> np.ndarray
 def linear_velocity(
     values: np.ndarray, fps: float, *, sigma: float = VELOCITY_SIGMA
 ) -> np.ndarray:
-    """Central differences, (x_{t+1} - x_{t-1}) fps / 2, one-sided at the ends, smoothed.
+    """Smoothed central differences, (x_{t+1} - x_{t-1}) fps / 2; one-sided at the ends.
 
     Args:
         values: track, (T, ...).

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from flashdex.motions.tracks import rotation
@@ -21,7 +23,10 @@ def unwrap_wrist(quats: np.ndarray) -> np.ndarray:
     Returns:
         rad, (T, 3).
     """
-    first = rotation(quats).as_euler("ZXY") * np.array([1.0, 1.0, -1.0])
+    with warnings.catch_warnings():
+        # at the singularity scipy warns and picks a valid solution, which is enough
+        warnings.simplefilter("ignore", UserWarning)
+        first = rotation(quats).as_euler("ZXY") * np.array([1.0, 1.0, -1.0])
     other = np.stack([first[:, 0] + np.pi, np.pi - first[:, 1], first[:, 2] + np.pi], 1)
     out = first.copy()
     for t in range(1, len(quats)):

@@ -14,18 +14,15 @@ from torchrl.objectives import LossModule
 
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
-from flashdex.modules.squash import sample_squashed, target_entropy
-from flashdex.objectives.batch import (
-    FlashBatch,
-    masked_mean,
-    nested,
-    read_pair,
-    stack_groups,
-)
-from flashdex.objectives.categorical import categorical_projection
+from flashdex.modules.squash import target_entropy
+from flashdex.objectives.batch import FlashBatch, nested, read_pair, stack_groups
 from flashdex.objectives.reward_normalizer import RewardNormalizer
-
-Metrics = dict[str, Tensor]
+from flashdex.objectives.terms import (
+    Metrics,
+    actor_objective,
+    alpha_objective,
+    qvalue_objective,
+)
 
 
 class FlashSACLoss(LossModule):
@@ -84,11 +81,8 @@ class FlashSACLoss(LossModule):
     ) -> None:
         super().__init__()
         self.groups: tuple[str | None, ...] = (None,) if groups is None else (*groups,)
-        if (
-            not len(self.groups)
-            == actor_network.num_groups
-            == qvalue_network.num_groups
-        ):
+        counts = {actor_network.num_groups, qvalue_network.num_groups}
+        if counts != {len(self.groups)}:
             raise ValueError(
                 f"{len(self.groups)} groups {self.groups}, {actor_network.num_groups} "
                 f"actor towers and {qvalue_network.num_groups} critic groups do not "
@@ -102,6 +96,8 @@ class FlashSACLoss(LossModule):
         self.log_alpha = nn.Parameter(
             torch.full((len(self.groups),), float(alpha_init)).log()
         )
+        encoders = (actor_network.future_encoder, qvalue_network.future_encoder)
+        self._reads_future = any(encoder is not None for encoder in encoders)
         self.target_entropy = target_entropy(actor_network.action_dim, target_sigma)
 
     @property
@@ -126,13 +122,10 @@ class FlashSACLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Entries that every batch must hold."""
         keys = self.tensor_keys
-        names = [
-            keys.observation,
-            ("next", keys.observation),
-            ("next", keys.terminated),
-        ]
-        if self.actor_network.future_encoder is not None:
-            names += [keys.future, ("next", keys.future)]
+        names = [keys.observation, nested("next", keys.observation)]
+        names.append(nested("next", keys.terminated))
+        if self._reads_future:
+            names += [keys.future, nested("next", keys.future)]
         for group in self.groups:
             names.append(nested(group, keys.action))
             names.append(nested("next", nested(group, keys.reward)))
@@ -144,13 +137,7 @@ class FlashSACLoss(LossModule):
     def read(self, tensordict: TensorDictBase) -> FlashBatch:
         """Stack the groups of a sampled batch and scale its rewards."""
         keys, following = self.tensor_keys, tensordict.get("next")
-        encoders = (
-            self.actor_network.future_encoder,
-            self.qvalue_network.future_encoder,
-        )
-        future = None
-        if any(encoder is not None for encoder in encoders):
-            future = read_pair(tensordict, keys.future)
+        future = read_pair(tensordict, keys.future) if self._reads_future else None
         reward = stack_groups(following, self.groups, keys.reward)
         if self.reward_normalizer is not None:
             reward = reward / self.reward_normalizer.denominator().to(reward.dtype)
@@ -199,13 +186,9 @@ class FlashSACLoss(LossModule):
             log_prob: of the actor loss, (G, B).
             weight: entries that count, (G, B), or None.
         """
-        entropy = -masked_mean(log_prob.detach(), weight)
-        excess = entropy - self.target_entropy
-        if weight is not None:
-            excess = torch.where(weight.sum(-1) > 0, excess, 0.0)
-        alpha = self.log_alpha.exp()
-        loss = alpha * excess
-        return loss.sum(), {"loss_alpha": loss.detach(), "alpha": alpha.detach()}
+        return alpha_objective(
+            self.log_alpha, log_prob, weight, target_entropy=self.target_entropy
+        )
 
     def qvalue_loss(
         self, tensordict: TensorDictBase, *, noise: Tensor | None = None
@@ -240,100 +223,28 @@ class FlashSACLoss(LossModule):
             }
         )
 
-    # -- pure tensor objectives (what a compiler sees) -------------------------
+    # -- the same on tensors, for steppers and compilers ------------------------
 
     def actor_objective(
         self, batch: FlashBatch, noise: Tensor
     ) -> tuple[Tensor, Metrics]:
-        """`actor_loss` on tensors; ``noise`` is (G, B, A)."""
-        first = slice(0, batch.size)
-        # both halves of the batch enter the statistics, only the first the loss
-        mean, std = self.actor_network(
-            batch.observation, batch.future, mode="train", keep=first
+        """`actor_loss` of a batch that is already read."""
+        return actor_objective(
+            self.actor_network, self.qvalue_network, self.log_alpha, batch, noise
         )
-        action, log_prob = sample_squashed(mean, std, noise)
-        observation, _, future, _ = batch.split()
-        log_p = self.qvalue_network(
-            observation, self._own_action_views(action), future, mode="frozen"
-        )
-        value = self.qvalue_network.expected_value(log_p).amin(1)
-        alpha = self.log_alpha.detach().exp()[:, None]
-        loss = masked_mean(alpha * log_prob - value, batch.weight)
-        metrics = {
-            "loss_actor": loss.detach(),
-            "entropy": -masked_mean(log_prob.detach(), batch.weight),
-            "q_value": masked_mean(value.detach(), batch.weight),
-            "log_prob": log_prob.detach(),
-        }
-        return loss.sum(), metrics
 
     def qvalue_objective(
         self, batch: FlashBatch, noise: Tensor
     ) -> tuple[Tensor, Metrics]:
-        """`qvalue_loss` on tensors; ``noise`` is (G, B, A)."""
-        size = batch.size
-        target, joint, metrics = self._target(batch, noise)
-        log_p = self.qvalue_network(
-            batch.observation, joint, batch.future, mode="train", keep=slice(0, size)
+        """`qvalue_loss` of a batch that is already read."""
+        return qvalue_objective(
+            self.actor_network,
+            self.qvalue_network,
+            self.target_qvalue_network,
+            self.log_alpha,
+            batch,
+            noise,
         )
-        cross_entropy = -(target[:, None] * log_p).sum(-1)
-        weight = None if batch.weight is None else batch.weight[:, None]
-        per_member = masked_mean(cross_entropy, weight)
-        with torch.no_grad():
-            critic = self.qvalue_network
-            error = target @ critic.atoms - critic.expected_value(log_p).mean(1)
-            metrics["td_error"] = masked_mean(error.abs(), batch.weight)
-            metrics["loss_qvalue"] = per_member.mean(1)
-        return per_member.mean(), metrics
-
-    @torch.no_grad()
-    def _target(
-        self, batch: FlashBatch, noise: Tensor
-    ) -> tuple[Tensor, Tensor, Metrics]:
-        """Target distribution (G, B, Z), joint actions (2B, G A) and metrics."""
-        _, after, _, next_future = batch.split()
-        mean, std = self.actor_network(after, next_future, mode="eval")
-        next_action, log_prob = sample_squashed(mean, std, noise)
-        joint = torch.cat([batch.action, _side_by_side(next_action)])
-        critic = self.target_qvalue_network
-        log_p = critic(
-            batch.observation,
-            joint,
-            batch.future,
-            mode="train",
-            keep=slice(batch.size, 2 * batch.size),
-        )
-        worst = critic.expected_value(log_p).argmin(1)  # over members, never groups
-        index = worst[:, None, :, None].expand(-1, 1, -1, critic.num_atoms)
-        prob = log_p.gather(1, index).squeeze(1).exp()
-        entropy_cost = self.log_alpha.exp()[:, None] * log_prob
-        target = categorical_projection(
-            prob,
-            reward=batch.reward,
-            discount=batch.discount,
-            terminated=batch.terminated,
-            entropy_cost=entropy_cost,
-            v_max=critic.v_max,
-        )
-        ends = target[..., 0] + target[..., -1]
-        return target, joint, {"clip_fraction": masked_mean(ends, batch.weight)}
-
-    def _own_action_views(self, action: Tensor) -> Tensor:
-        """Joint action once per group; only its own part carries gradient.
-
-        Args:
-            action: fresh samples (G, B, A).
-
-        Returns:
-            (B, A) for one group, else (G, B, G A).
-        """
-        joint = _side_by_side(action)
-        groups, _, width = action.shape
-        if groups == 1:
-            return joint
-        own = torch.eye(groups, dtype=torch.bool, device=action.device)
-        own = own.repeat_interleave(width, 1)[:, None]
-        return torch.where(own, joint, joint.detach())
 
     def _noise(self, tensordict: TensorDictBase, noise: Tensor | None) -> Tensor:
         if noise is not None:
@@ -341,8 +252,3 @@ class FlashSACLoss(LossModule):
         action = tensordict.get(nested(self.groups[0], self.tensor_keys.action))
         shape = (len(self.groups), action.shape[0], self.actor_network.action_dim)
         return torch.randn(shape, dtype=action.dtype, device=action.device)
-
-
-def _side_by_side(action: Tensor) -> Tensor:
-    """(G, B, A) to (B, G A)."""
-    return action.transpose(0, 1).flatten(1)

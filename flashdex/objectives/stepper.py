@@ -10,8 +10,9 @@ from torch import Tensor
 
 from flashdex.modules.layers import project_
 from flashdex.objectives.batch import FlashBatch, nested
-from flashdex.objectives.flashsac import FlashSACLoss, Metrics
+from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.optim import ScheduledAdam, TargetAverage
+from flashdex.objectives.terms import Metrics
 
 ACTOR_METRICS = ("loss_actor", "entropy", "q_value", "loss_alpha", "alpha")
 

@@ -78,8 +78,8 @@ class AlgoConfig:
     """Standard deviation that sets the target entropy, each action dimension."""
     init_std: float = number(0.082, above=0, high=1)
     """Standard deviation of the policy at the start (centred head)."""
-    head: Literal["centred", "normalised"] = "centred"
-    """centred starts at mean 0, on the reference; normalised is FlashSAC's own."""
+    head: Literal["centred", "unit"] = "centred"
+    """centred starts at mean 0, on the reference; unit is FlashSAC's own."""
     future_latent: int = number(128, low=1)
     """Width of the encoded future window."""
     future_channels: list[int] = dataclasses.field(

@@ -94,18 +94,22 @@ def inspect_recipe(
     return recipe, problems + found
 
 
-def load_recipe(path: str | Path) -> Recipe:
-    """Read a complete recipe, as `dump_recipe` wrote it, without composing."""
+def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+    """Read a complete recipe, as `dump_recipe` wrote it, without composing.
+
+    Args:
+        path: the file, `recipe.yaml` of a run for example.
+        overrides: values to change (`key=value`); groups cannot be chosen any more.
+    """
     if not Path(path).is_file():
         raise FlashdexError(f"{path}: there is no such recipe file")
-    config = OmegaConf.load(path)
-    problems: list[str] = []
-    data = _to_container(config, problems) if isinstance(config, DictConfig) else {}
-    recipe, found = read_recipe(data)
-    problems += found
-    if problems:
-        raise RecipeError(problems, where=str(path))
-    return recipe
+    try:
+        config = OmegaConf.load(path)
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise RecipeError([" ".join(str(error).split())], where=str(path)) from error
+    if not isinstance(config, DictConfig):
+        raise RecipeError(["expected keys and values"], where=str(path))
+    return _change(config, overrides, where=str(path))
 
 
 def dump_recipe(recipe: Recipe, path: str | Path | None = None) -> str:
@@ -117,14 +121,18 @@ def dump_recipe(recipe: Recipe, path: str | Path | None = None) -> str:
 
 
 def override_recipe(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Change values of a composed recipe (`train --resume RUN key=value`)."""
-    parsed, problems = parse_overrides(overrides)
+    """Change values of a composed recipe."""
     config = OmegaConf.create(dataclasses.asdict(recipe))
+    return _change(config, overrides, where=f"recipe {recipe.name}")
+
+
+def _change(config: DictConfig, overrides: Sequence[str], *, where: str) -> Recipe:
+    parsed, problems = parse_overrides(overrides)
     apply_values(config, parsed, {}, problems)
-    changed, found = read_recipe(_to_container(config, problems))
+    recipe, found = read_recipe(_to_container(config, problems))
     if problems + found:
-        raise RecipeError(problems + found, where=f"recipe {recipe.name}")
-    return changed
+        raise RecipeError(problems + found, where=where)
+    return recipe
 
 
 def _base() -> dict[str, Any]:

@@ -6,7 +6,6 @@ These dataclasses are the one place of defaults. Metres, radians, seconds, kilog
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -81,11 +80,6 @@ class PhysicsConfig:
     """Line-search iterations."""
     num_threads: int = number(0, low=0)
     """Threads of the cpu engine; 0 = all cores."""
-
-    @property
-    def step_dt(self) -> float:
-        """Control step, s."""
-        return self.decimation * self.timestep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,8 +200,3 @@ class EnvConfig:
     """Failure terminations by name; null removes one."""
     assist: AssistConfig | None = dataclasses.field(default_factory=AssistConfig)
     """The fading wrench on objects; null is the same as enabled: false."""
-
-    @property
-    def num_attempt_envs(self) -> int:
-        """Worlds that make attempts: at least one when the share is not zero."""
-        return min(self.num_envs, math.ceil(self.attempt_share * self.num_envs))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 
 from flashdex.recipe.algo import AlgoConfig, LoggerConfig, TrainConfig
 from flashdex.recipe.env import EnvConfig, MotionsConfig, PhysicsConfig
@@ -60,9 +59,3 @@ class Recipe:
     """Metric writers."""
     expect: list[Expectation] = dataclasses.field(default_factory=list)
     """Promised numbers."""
-
-    @property
-    def output_dir(self) -> Path:
-        """Folder of the run: `run_dir`, or one made of name, ablation and seed."""
-        name = f"{self.name}-{self.ablation}-s{self.seed}"
-        return Path(self.run_dir or f"runs/{name}")

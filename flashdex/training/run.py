@@ -19,7 +19,6 @@ from flashdex.training.ledger import Ledger, write_atomic
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
 from flashdex.training.setup import Workbench, open_workbench
-from flashdex.training.summary import summarise
 
 _LOG = logging.getLogger(__name__)
 RECIPE, VERSIONS, BASELINES = "recipe.yaml", "versions.json", "baselines.json"
@@ -130,5 +129,4 @@ def _train(bench: Workbench, run_dir: Path, state: dict[str, Any] | None) -> Pat
     finally:
         log.close()
     _LOG.info("ended after %d env steps: %s", trainer.env_steps, why)
-    summarise(run_dir, bench, ledger, baselines, why=why)
     return run_dir

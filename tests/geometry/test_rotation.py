@@ -93,7 +93,9 @@ def test_half_turn_is_finite():
     assert torch.isfinite(vector).all()
     close(vector.norm(), torch.tensor(math.pi, dtype=torch.float64))
     half = rot.quat_slerp(IDENTITY, q, 0.5)
-    close(rot.quat_angle(half, IDENTITY), torch.tensor(math.pi / 2, dtype=torch.float64))
+    close(
+        rot.quat_angle(half, IDENTITY), torch.tensor(math.pi / 2, dtype=torch.float64)
+    )
 
 
 def test_both_signs_are_one_rotation(quats, vectors):
@@ -128,7 +130,9 @@ def test_slerp_matches_scipy_and_takes_the_short_way(quats):
         assert (to_scipy(got[i]).inv() * want).magnitude() < 1e-7
     close(rot.quat_angle(a, got), share * rot.quat_angle(a, b))
     close(rot.quat_slerp(a, b, 0.0), a)
-    close(rot.quat_angle(rot.quat_slerp(a, -b, 0.3), rot.quat_slerp(a, b, 0.3)), 0 * share)
+    close(
+        rot.quat_angle(rot.quat_slerp(a, -b, 0.3), rot.quat_slerp(a, b, 0.3)), 0 * share
+    )
 
 
 def test_transform_points_and_back(quats, vectors):

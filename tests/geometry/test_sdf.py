@@ -39,7 +39,9 @@ def grid():
 
 def random_points(count, reach, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5) * reach
+    return (
+        torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5
+    ) * reach
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Hand-made rollouts: poses with known errors, and a small scene stepped by MuJoCo C."""
+"""Hand-made rollouts: poses with known errors, and a scene stepped by MuJoCo C."""
 
 import json
 
@@ -24,7 +24,9 @@ def turn_z(angle):
 def poses():
     """Build signals of moving objects whose errors are given, one column a slot."""
 
-    def build(pos_error, rot_error=None, *, moving=None, tips=None, joints=None, **masks):
+    def build(
+        pos_error, rot_error=None, *, moving=None, tips=None, joints=None, **masks
+    ):
         pos_error = torch.as_tensor(pos_error, dtype=torch.float64)
         length, slots = pos_error.shape
         rot_error = torch.zeros_like(pos_error) if rot_error is None else rot_error
@@ -45,7 +47,9 @@ def poses():
                 shape = (length, 2, size, 3)
                 data[f"ref_{key}"] = torch.zeros(shape, dtype=torch.float64)
                 data[key] = torch.zeros(shape, dtype=torch.float64)
-                data[key][..., 1] = torch.as_tensor(value, dtype=torch.float64)[..., None]
+                data[key][..., 1] = torch.as_tensor(value, dtype=torch.float64)[
+                    ..., None
+                ]
         masks = {
             "hand_active": (slots == 2, True),
             "hand_object": (0, 1) if slots == 2 else (-1, 0),
@@ -66,7 +70,9 @@ SCENE = f"""
     <body name="left_base" pos="-.12 0 .03">
       <joint name="left_slide" type="slide" axis="1 0 0" range="-.05 .6" damping="1"/>
       <geom type="box" size=".02 .04 .02" mass=".2"/>{SITES}
-      <body name="left_tip" pos=".02 0 0"><geom type="sphere" size=".005" mass=".01"/></body>
+      <body name="left_tip" pos=".02 0 0">
+        <geom type="sphere" size=".005" mass=".01"/>
+      </body>
     </body>
     <body name="box" pos="0 0 .03">
       <freejoint name="box"/>
@@ -74,7 +80,7 @@ SCENE = f"""
     </body>
   </worldbody>
   <actuator>
-    <position name="left_slide" joint="left_slide" kp="400" kv="20" forcerange="-40 40"/>
+    <position joint="left_slide" kp="400" kv="20" forcerange="-40 40"/>
   </actuator>
 </mujoco>"""
 

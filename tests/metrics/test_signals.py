@@ -41,7 +41,10 @@ def rotation_error(angle, dtype=torch.float64):
 @pytest.mark.parametrize("angle", [1e-7, 1e-3, 0.5, 3.0, math.pi])
 def test_rotation_error_keeps_its_digits(angle):
     torch.testing.assert_close(
-        rotation_error(angle), torch.full((3, 1), angle).double(), atol=1e-9, rtol=0
+        rotation_error(angle),
+        torch.full((3, 1), angle, dtype=torch.float64),
+        atol=1e-9,
+        rtol=0,
     )
 
 
@@ -88,7 +91,9 @@ def test_drift_of_a_linear_motion_is_half_its_length():
 def test_twice_the_rate_scores_like_every_second_frame():
     generator = torch.Generator().manual_seed(0)
     ref = torch.cumsum(torch.randn(60, 1, 3, generator=generator) * 1e-2, 0)
-    fast = ref.repeat_interleave(2, 0) + torch.randn(120, 1, 3, generator=generator) * 0.03
+    fast = (
+        ref.repeat_interleave(2, 0) + torch.randn(120, 1, 3, generator=generator) * 0.03
+    )
     quats = IDENTITY.expand(60, 1, 4)
     rows = align_to_reference(120, 60, fps=100, ref_fps=50)
     aligned = score(one_object(fast[rows], quats, ref, quats))

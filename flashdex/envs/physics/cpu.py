@@ -13,7 +13,7 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.physics.base import WrenchFn
-from flashdex.envs.scene import Scene, SceneLayout, build_scene, parked_joint_pos
+from flashdex.envs.scene import Scene, build_scenes, parked_joint_pos
 from flashdex.geometry.rotation import quat_rotate, quat_rotate_inverse
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
@@ -21,11 +21,14 @@ from flashdex.motions.library import MotionLibrary
 if TYPE_CHECKING:
     from flashdex.recipe import PhysicsConfig
 
-_BAD = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
+_BAD = [
+    int(w)
+    for w in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+]
 
 
 class CpuPhysics:
@@ -48,12 +51,8 @@ class CpuPhysics:
         self.num_envs = num_envs
         self.decimation = physics.decimation
         self.step_dt = physics.timestep * physics.decimation
-        layout = SceneLayout.of(library)
-        self.scenes: list[Scene] = [
-            build_scene(library, m, hands, physics, layout)
-            for m in range(library.num_motions)
-        ]
-        self.layout = layout
+        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        self.layout = layout = self.scenes[0].layout
         self.num_slots = library.motions["object_index"].shape[1]
         scene = self.scenes[0]
         self.batch = Batch(scene.model, nsim=num_envs, nthread=physics.num_threads)
@@ -163,7 +162,8 @@ class CpuPhysics:
         return self.scenes[int(self._motion[env])]
 
     def _bad_count(self) -> np.ndarray:
-        return np.asarray(self.batch.warning)[:, list(_BAD)].sum(-1).astype(np.int64)
+        # Columns of the last axis: last info, count.
+        return self.batch.warning[:, _BAD, 1].sum(-1).astype(np.int64)
 
     def _objects(self) -> tuple[Tensor, Tensor]:
         n, used = self.num_envs, self.layout.num_objects

@@ -18,7 +18,9 @@ def _read_keypoints(
 ) -> list[HumanDemo]:
     del seed  # files hold no chance
     if path is None:
-        raise DemoError("keypoints: no input. Give a folder of .npz files, or one file.")
+        raise DemoError(
+            "keypoints: no input. Give a folder of .npz files, or one file."
+        )
     return read_keypoints(path, limit=limit)
 
 

@@ -113,7 +113,10 @@ def _hand_path(
     share = _largest_opening(grasp, rest)
     steps = np.linspace(0, 1, 33)
     shapes = np.stack(
-        [grasp.keypoints(grasp.angles + s * share * (OPEN - grasp.angles)) for s in steps]
+        [
+            grasp.keypoints(grasp.angles + s * share * (OPEN - grasp.angles))
+            for s in steps
+        ]
     )
     place = np.clip(opening, 0, 1) * (len(steps) - 1)
     low = np.minimum(place.astype(int), len(steps) - 2)
@@ -137,7 +140,9 @@ def _largest_opening(grasp: Grasp, rest: float) -> float:
 def grasp_target(shape: Shape, rng: np.random.Generator) -> GraspTarget:
     """Fingertips on opposite sides of the object, palm inclined towards it."""
     across = shape.across
-    approach = np.array([0.0, 0.0, -1.0] if shape.approach == "top" else [0.0, 1.0, 0.0])
+    approach = np.array(
+        [0.0, 0.0, -1.0] if shape.approach == "top" else [0.0, 1.0, 0.0]
+    )
     tilt = PALM_TILT[shape.approach]
     x = np.cos(tilt) * across + np.sin(tilt) * approach
     z = np.cos(tilt) * approach - np.sin(tilt) * across

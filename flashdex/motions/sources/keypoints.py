@@ -1,8 +1,8 @@
 """Reads recordings given as hand keypoints and object poses, one .npz a recording.
 
 Keys: ``fps``, ``object`` (the mesh is ``meshes/<object>.obj`` beside the file),
-``obj_pose`` (T, 7), and per recorded hand ``kp_left`` (T, 21, 3) and ``palm_left`` (T, 7),
-likewise right. Metres, quaternions wxyz, z up. ``segments*.json`` beside the files cuts
+``obj_pose`` (T, 7), and per recorded hand ``kp_left`` (T, 21, 3) and, if known,
+``palm_left`` (T, 7); right likewise. Metres, quaternions wxyz, z up. ``segments*.json`` beside the files cuts
 recordings into motions called ``<clip>_<start>_<end>``.
 """
 
@@ -57,7 +57,9 @@ def read_file(file: Path) -> HumanDemo:
         with np.load(file, allow_pickle=False) as stored:
             data = {key: stored[key] for key in stored.files}
     except (OSError, ValueError) as error:
-        raise DemoError(f"{file}: not a readable .npz without pickles: {error}") from error
+        raise DemoError(
+            f"{file}: not a readable .npz without pickles: {error}"
+        ) from error
     missing = [key for key in REQUIRED if key not in data]
     hands = [side for side in SIDES if f"kp_{side}" in data]
     if missing or not hands:

@@ -1,8 +1,8 @@
 """The embedded collection: made-up human motions that look like reconstructed mocap.
 
 A parametric human hand grasps a simple object, lifts, moves and turns it, and puts it
-down. Keypoints carry smooth noise, and fingertips stay some millimetres off the surface,
-as in real recordings. Everything follows from the seed.
+down. Keypoints carry smooth noise, and fingertips stay some millimetres off the
+surface, as in real recordings. Everything follows from the seed.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _plan(kind: Kind, rng: np.random.Generator) -> CarryPlan:
 
 
 def _noise(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Smooth reconstruction noise of keypoints (T, 21, 3), m: rigid and single parts."""
+    """Smooth reconstruction noise of keypoints (T, 21, 3), m: rigid and single."""
     frames = len(points)
     shift = NOISE_RIGID * smooth_noise((frames, 1, 3), rng)
     turn = Rotation.from_rotvec(NOISE_TURN * smooth_noise((frames, 3), rng))

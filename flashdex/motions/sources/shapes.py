@@ -1,4 +1,4 @@
-"""Objects of the procedural collection: meshes in their rest pose, and how to hold them.
+"""Objects of the procedural collection: meshes at rest, and how to hold them.
 
 Every mesh has z up as it stands on the table, and its origin at the centre of its box.
 """

@@ -1,0 +1,83 @@
+"""What no learning achieves: the scores every policy is read against."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.metrics.criteria import score
+from flashdex.training.ledger import write_atomic
+from flashdex.training.rollouts import roll_all
+from flashdex.training.setup import Workbench
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Scores of each baseline on each motion.
+
+    Attributes:
+        rows: baseline -> motion -> {"passed": criteria, "errors": ..., "why": ...}.
+    """
+
+    rows: dict[str, dict[str, dict[str, Any]]]
+
+    def trivial(self, criterion: str) -> dict[str, list[str]]:
+        """Baselines that already pass ``criterion``, by motion."""
+        out: dict[str, list[str]] = {}
+        for name, motions in self.rows.items():
+            for motion, row in motions.items():
+                if criterion in row["passed"]:
+                    out.setdefault(motion, []).append(name)
+        return out
+
+
+def hold_first_pose(env: TrackingEnv) -> Tensor:
+    """``do_nothing``: the hand holds its first reference joint position."""
+    first = torch.zeros_like(env.motion)
+    return env.bank.at(env.motion, first, ("joint_pos",))["joint_pos"]
+
+
+def follow_reference(env: TrackingEnv) -> Tensor:
+    """``kinematic_playback``: the retargeted joints as position targets."""
+    return env.bank.at(env.motion, env.frame, ("joint_pos",))["joint_pos"]
+
+
+BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}
+
+
+def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
+    """Roll and score all baselines on all motions; reuse the file of this run.
+
+    Args:
+        bench: motions and recipe.
+        path: JSON file that keeps the result.
+    """
+    if path is not None and path.is_file():
+        return Baselines(json.loads(path.read_text(encoding="utf-8")))
+    joints = bench.bank.num_joints
+
+    def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
+        return torch.zeros(env.num_envs, 2, joints)
+
+    rows: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, target in BASELINES.items():
+        criterion = bench.recipe.train.criterion
+        rows[name] = {}
+        for attempt in roll_all(bench, idle, criterion=criterion, target=target):
+            verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
+            verdict = verdicts[criterion]
+            rows[name][attempt.rollout.motion] = {
+                "passed": [k for k, v in verdicts.items() if v.is_passed],
+                "state": verdict.state,
+                "errors": {k: round(v, 5) for k, v in verdict.values.items()},
+            }
+    if path is not None:
+        write_atomic(path, json.dumps(rows, indent=1))
+    return Baselines(rows)

@@ -1,0 +1,89 @@
+"""``flashdex replay``: recompute every certificate of a run from its files alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from flashdex.errors import RunError
+from flashdex.metrics.certificate import certify
+from flashdex.metrics.rollout import Rollout
+from flashdex.training.ledger import CONVERSIONS, ROLLOUTS, read_lines
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """One recomputed certificate.
+
+    Attributes:
+        motion: name.
+        stored: verdict in the run's files, None when there is none.
+        found: verdict of this replay.
+        agrees: both are the same and their nominal errors are equal to 1e-9.
+    """
+
+    motion: str
+    stored: str | None
+    found: str
+    agrees: bool
+
+    @property
+    def holds(self) -> bool:
+        """The conversion is proven, and the files say so truthfully."""
+        return self.agrees and self.found in ("certified", "robust")
+
+
+def replay(run: str | Path) -> list[Replayed]:
+    """Re-simulate every stored rollout in MuJoCo C and compare the certificates.
+
+    Args:
+        run: run directory.
+
+    Returns:
+        One entry a stored rollout.
+
+    Raises:
+        RunError: there is nothing to replay, or a file is broken.
+    """
+    run_dir = Path(run)
+    files = sorted((run_dir / ROLLOUTS).glob("*.npz"))
+    claimed = [row for row in read_lines(run_dir / CONVERSIONS) if row.get("rollout")]
+    if not files and not claimed:
+        raise RunError(
+            f"{run_dir}: no stored rollout in '{ROLLOUTS}/'. Either nothing has been "
+            "converted yet, or this is not a run directory."
+        )
+    missing = [r["rollout"] for r in claimed if not (run_dir / r["rollout"]).is_file()]
+    if missing:
+        raise RunError(
+            f"{run_dir}: {CONVERSIONS} names {missing[0]}, which is missing. A "
+            "conversion without its rollout cannot be proven; restore the file."
+        )
+    return [_replay_one(file) for file in files]
+
+
+def _replay_one(file: Path) -> Replayed:
+    rollout = Rollout.load(file)
+    found = certify(rollout)
+    path = file.with_suffix(".certificate.json")
+    if not path.is_file():
+        return Replayed(rollout.motion, None, found.verdict, agrees=True)
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    agrees = stored["verdict"] == found.verdict and _same_numbers(
+        stored["nominal"], json.loads(found.to_json())["nominal"]
+    )
+    return Replayed(rollout.motion, stored["verdict"], found.verdict, agrees)
+
+
+def _same_numbers(stored: dict, found: dict) -> bool:  # type: ignore[type-arg]
+    for name, verdict in stored.items():
+        other = found.get(name)
+        if other is None or other["state"] != verdict["state"]:
+            return False
+        for key, value in verdict["values"].items():
+            if value is None:
+                continue
+            if abs(value - other["values"][key]) > 1e-9:
+                return False
+    return True

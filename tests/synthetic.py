@@ -1,0 +1,170 @@
+"""A motion library made of formulas, in a fraction of a second, for env and training.
+
+Three motions: the right hand with a box, the left hand with a ball, both hands with
+both. The fingers close on the objects, so that there are contacts from early on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from flashdex.hands.kinematics import HandKinematics
+from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from flashdex.motions.objects import ObjectAsset
+
+FPS = 60.0
+HALF = np.array([0.025, 0.03, 0.02])  # m, half extents of the box
+BALL = 0.03  # m, radius
+LENGTHS = {"right_box": 40, "left_ball": 31, "both": 52}
+# Wrist hinges with the palm down, fingers half closed; left, right.
+HINGES = np.array([[-0.4, 1.19, -0.13], [2.98, -1.19, 0.01]])
+FINGERS = np.array([1.4, 0.5, 0.4, 0.1, 0.8, 0.6, 0.9, 0.6, 0.9, 0.6, 0.7, 1.0])
+
+
+def write_library(path, hands):
+    """Write three motions of 40, 31 and 52 frames and open the library."""
+    writer = LibraryWriter(path, hand="xhand", fps=FPS)
+    box, ball = make_box(), make_ball()
+    plans = {
+        "right_box": ((False, True), (-1, 0), [box]),
+        "left_ball": ((True, False), (0, -1), [ball]),
+        "both": ((True, True), (1, 0), [box, ball]),
+    }
+    disks = np.full((4, 5), np.nan)
+    disks[0] = [0.0, 0.0, 0.0, 0.8, 0.02]
+    for name, (active, owner, objects) in plans.items():
+        frames = make_frames(hands, LENGTHS[name], active, owner, objects)
+        writer.add(MotionRecord(name, frames, active, owner, objects, disks))
+    return MotionLibrary.load(writer.write())
+
+
+def make_frames(hands, length, active, owner, objects):
+    """Every frame key of one motion, float64 numpy, from formulas."""
+    time = np.arange(length) / FPS
+    phase = np.arange(length) / (length - 1)
+    lift = 0.06 * np.clip(phase - 0.5, 0, None)
+    rest = [-o.aabb[0, 2] for o in objects]
+    pos, quat = np.zeros((length, 2, 3)), np.zeros((length, 2, 4))
+    quat[..., 0] = 1.0
+    for slot in range(len(objects)):
+        x = 0.15 * (1 - 2 * slot) if len(objects) == 2 else 0.02
+        pos[:, slot] = np.stack([0 * lift + x, 0.1 * lift, rest[slot] + lift], -1)
+        turn = Rotation.from_euler("z", (0.3 + 2.0 * lift)[:, None]).as_quat()
+        quat[:, slot] = turn[:, [3, 0, 1, 2]]
+    joints = np.zeros((length, 2, 18))
+    for side in range(2):
+        joints[:, side, 3:6] = HINGES[side] + 0.05 * np.sin(3 * time)[:, None]
+        joints[:, side, 6:] = FINGERS * (0.9 + 0.15 * phase[:, None])
+    centre = np.stack(
+        [pos[:, max(0, s)] if on else pos[:, 0] + [-1.0, 0, 1.0]
+         for s, on in zip(owner, active, strict=True)],
+        1,
+    )
+    kinematics = HandKinematics(hands)
+    tips = kinematics(torch.as_tensor(joints).float(), None)["tip_pos"].double()
+    joints[..., :3] = centre + [0, 0, 0.008] - tips.mean(2).numpy()
+    vel = np.gradient(joints, 1 / FPS, axis=0)
+    kin = kinematics(torch.as_tensor(joints).float(), torch.as_tensor(vel).float())
+    keypoints, keypoint_vel = human_hand(hands, kin, time)
+    distance = np.linalg.norm(
+        keypoints[:, :, [4, 8, 12, 16, 20]] - centre[:, :, None], axis=-1
+    )
+    return {
+        "joint_pos": joints,
+        "joint_vel": vel,
+        "wrist_pos": keypoints[:, :, 0],
+        "wrist_quat": kin["wrist_quat"].double().numpy(),
+        "wrist_linvel": keypoint_vel[:, :, 0],
+        "wrist_angvel": kin["wrist_angvel"].double().numpy(),
+        "keypoints": keypoints,
+        "keypoint_linvel": keypoint_vel,
+        "tip_dist": np.clip(distance - 0.02, 0.0, None),
+        "object_pos": pos,
+        "object_quat": quat,
+        "object_linvel": np.gradient(pos, 1 / FPS, axis=0),
+        "object_angvel": spin_of(quat),
+    }
+
+
+def human_hand(hands, kin, time):
+    """Keypoints near the robot's links, a few millimetres off, and their velocities."""
+    points = kin["wrist_pos"].double().numpy()[:, :, None].repeat(21, 2)
+    for side, name in enumerate(("left", "right")):
+        for link, keypoint in hands[name].keypoint_links:
+            points[:, side, keypoint] = kin["link_pos"][:, side, link].double().numpy()
+    points[:, :, [4, 8, 12, 16, 20]] = kin["tip_pos"].double().numpy()
+    offset = 0.004 * np.sin(np.arange(21) + 5 * time[:, None])
+    points = points + offset[:, None, :, None] * np.array([1.0, -0.5, 0.3])
+    return points, np.gradient(points, 1 / FPS, axis=0)
+
+
+def spin_of(quat):
+    """World angular velocity by central differences, (T, O, 3)."""
+    turns = [Rotation.from_quat(quat[:, s][:, [1, 2, 3, 0]]) for s in range(2)]
+    out = np.zeros((len(quat), 2, 3))
+    for slot, turn in enumerate(turns):
+        step = (turn[2:] * turn[:-2].inv()).as_rotvec() * FPS / 2
+        out[1:-1, slot] = step
+    return out
+
+
+def make_box():
+    """A box whose centre of mass lies off its frame."""
+    mass = 0.12
+    square = (2 * HALF) ** 2
+    inertia = np.diag(mass / 12 * (square.sum() - square))
+    inertia[0, 1] = inertia[1, 0] = 4e-6
+    mesh = trimesh.creation.box(extents=2 * HALF)
+    grid = np.random.default_rng(0).uniform(-1, 1, (128, 3))
+    grid[np.arange(128), np.arange(128) % 3] = np.sign(grid[np.arange(128), 0])
+    points = grid * HALF
+
+    def distance(p):
+        gap = np.abs(p) - HALF
+        outside = np.linalg.norm(np.clip(gap, 0, None), axis=-1)
+        return outside + np.clip(gap.max(-1), None, 0)
+
+    com = np.array([0.003, -0.002, 0.001])
+    return make_asset("box", mesh, points, distance, mass, com, inertia)
+
+
+def make_ball():
+    """A ball, centred."""
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=BALL)
+    draw = np.random.default_rng(1).normal(size=(128, 3))
+    points = BALL * draw / np.linalg.norm(draw, axis=-1, keepdims=True)
+    mass = 0.09
+    inertia = np.eye(3) * 0.4 * mass * BALL**2
+
+    def distance(p):
+        return np.linalg.norm(p, axis=-1) - BALL
+
+    return make_asset("ball", mesh, points, distance, mass, np.zeros(3), inertia)
+
+
+def make_asset(name, mesh, points, distance, mass, com, inertia):
+    """An object from closed forms."""
+    axis = np.linspace(-0.09, 0.09, 37)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return ObjectAsset(
+        name=name,
+        points=np.float32(points),
+        normals=np.float32(points / np.linalg.norm(points, axis=-1, keepdims=True)),
+        radius=float(np.linalg.norm(points, axis=-1).max()),
+        parts=[np.float32(mesh.vertices)],
+        sdf=np.float32(distance(nodes)),
+        sdf_origin=np.float32([-0.09] * 3),
+        sdf_spacing=float(axis[1] - axis[0]),
+        mass=mass,
+        com=np.float32(com),
+        inertia=np.float32(inertia),
+        aabb=np.float32(mesh.bounds),
+        watertight=True,
+        sha256=name,
+        visual_vertices=np.float32(mesh.vertices),
+        visual_faces=np.asarray(mesh.faces, np.int32),
+    )

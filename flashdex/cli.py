@@ -7,6 +7,7 @@ Exit codes: 0 done; 1 the answer is no (a replay that fails, something missing);
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import sys
@@ -126,6 +127,15 @@ def _add_run_verbs(
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
     verb.add_argument("run_dir", type=Path, metavar="RUN")
 
+    verb = add("score", _score, "score stored rollouts by every criterion")
+    verb.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="rollout .npz"
+    )
+    verb.add_argument("--json", action="store_true", help="print JSON")
+
+    verb = add("report", _report, "write report.html of a run again")
+    verb.add_argument("run_dir", type=Path, metavar="RUN")
+
     verb = add("bench", _bench, "measure; prints JSON")
     verb.add_argument("what", choices=["env"], help="what to measure")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
@@ -184,7 +194,7 @@ def _train(args: argparse.Namespace) -> int:
         from flashdex.training.run import resume
 
         first = [args.recipe] if args.recipe else []
-        resume(args.resume, first + args.overrides)
+        _show_run(resume(args.resume, first + args.overrides))
         return 0
     if args.recipe is None:
         raise FlashdexError("give a recipe (see `flashdex ls`) or --resume RUN")
@@ -198,21 +208,59 @@ def _train(args: argparse.Namespace) -> int:
     from flashdex.training.run import train
 
     for recipe in recipes:
-        train(recipe)
+        _show_run(train(recipe))
     return 0
+
+
+def _show_run(run_dir: Path) -> None:
+    from flashdex.viz.report import write_report
+    from flashdex.viz.table import run_table
+
+    print(run_table(run_dir))
+    print(f"\nreport: {write_report(run_dir)}")
 
 
 def _evaluate(args: argparse.Namespace) -> int:
     from flashdex.training.evaluate import evaluate
+    from flashdex.viz.table import evaluation_table
 
-    evaluate(args.run_dir, args.overrides)
+    found = evaluate(args.run_dir, args.overrides)
+    print(evaluation_table(found.rows, found.totals))
     return 0
 
 
 def _replay(args: argparse.Namespace) -> int:
     from flashdex.training.replay_run import replay
+    from flashdex.viz.table import replay_line
 
-    return 0 if replay(args.run_dir) else 1
+    replayed = replay(args.run_dir)
+    for one in replayed:
+        print(replay_line(one.motion, one.stored, one.found, holds=one.holds))
+    return 0 if all(one.holds for one in replayed) else 1
+
+
+def _score(args: argparse.Namespace) -> int:
+    from flashdex.metrics.criteria import score
+    from flashdex.metrics.rollout import Rollout
+    from flashdex.viz.table import score_table
+
+    found = {}
+    for path in args.files:
+        rollout = Rollout.load(path)
+        found[str(path)] = score(rollout.signals(), grace=rollout.grace)
+    if args.json:
+        plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
+        print(json.dumps(plain, indent=1))
+    else:
+        print("\n\n".join(score_table(f, s) for f, s in found.items()))
+    return 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    from flashdex.viz.report import write_report
+
+    print(write_report(args.run_dir))
+    return 0
 
 
 def _bench(args: argparse.Namespace) -> int:

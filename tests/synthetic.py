@@ -60,13 +60,15 @@ def make_frames(hands, length, active, owner, objects):
         joints[:, side, 3:6] = HINGES[side] + 0.05 * np.sin(3 * time)[:, None]
         joints[:, side, 6:] = FINGERS * (0.9 + 0.15 * phase[:, None])
     centre = np.stack(
-        [pos[:, max(0, s)] if on else pos[:, 0] + [-1.0, 0, 1.0]
-         for s, on in zip(owner, active, strict=True)],
+        [
+            pos[:, max(0, s)] if on else pos[:, 0] + [-1.0, 0, 1.0]
+            for s, on in zip(owner, active, strict=True)
+        ],
         1,
     )
     kinematics = HandKinematics(hands)
     tips = kinematics(torch.as_tensor(joints).float(), None)["tip_pos"].double()
-    joints[..., :3] = centre + [0, 0, 0.008] - tips.mean(2).numpy()
+    joints[..., :3] = centre + np.array([0, 0, 0.008]) - tips.mean(2).numpy()
     vel = np.gradient(joints, 1 / FPS, axis=0)
     kin = kinematics(torch.as_tensor(joints).float(), torch.as_tensor(vel).float())
     keypoints, keypoint_vel = human_hand(hands, kin, time)

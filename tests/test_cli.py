@@ -59,6 +59,11 @@ def test_debug_shows_the_traceback():
         (["ls", "something"], "unknown: something"),
         (["train", "quickstart", "env.num_env=3"], "Did you mean 'num_envs'?"),
         (["validate", "/nowhere/x.yaml"], "no such file"),
+        (["score", "/nowhere/x.npz"], "no such file"),
+        (["score"], "required"),
+        (["report", "/nowhere"], "not a run directory"),
+        (["replay", "/nowhere"], "no stored rollout"),
+        (["replay", "/nowhere", "more"], "unknown: more"),
     ],
 )
 def test_mistakes_exit_two(run, argv, expected):

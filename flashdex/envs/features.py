@@ -17,7 +17,7 @@ from flashdex.geometry.rotation import (
     quat_mul,
     quat_rotate,
     quat_rotate_inverse,
-    quat_to_rot6d,
+    quat_to_matrix,
 )
 from flashdex.geometry.sdf import SdfGrid
 
@@ -218,42 +218,58 @@ def contact(kin: TensorDictBase, code: Tensor) -> Tensor:
 
 def future_window(
     kin: TensorDictBase,
-    window: TensorDictBase,
+    vectors: Tensor,
+    rotations: Tensor,
     own_pos: Tensor,
     own_quat: Tensor,
     own_vel: Tensor,
 ) -> Tensor:
     """Eq. (4): coming reference frames relative to the current simulation.
 
+    All frames of a hand share its wrist rotation, so each quantity is one small matrix
+    product a hand instead of one a frame.
+
     Args:
         kin: forward kinematics.
-        window: reference frames, batch (N, K).
+        vectors: object position, linear, angular velocity, wrist position and five
+            fingertips of the coming frames, world, (N, K, 2, 9, 3).
+        rotations: transposed rotation matrices of object and wrist, (N, K, 2, 2, 3, 3).
         own_pos: own object, world, m, (N, 2, 3).
         own_quat: own object, (N, 2, 4).
         own_vel: own object, (N, 2, 6).
 
     Returns:
         (N, 2, 39, K): object position 3, rotation 6, linear 3, angular 3, wrist
-        position 3, rotation 6, fingertips 15; all in the current wrist frame.
+        position 3, rotation 6, fingertips 15; all in the current wrist frame. Rotations
+        are the first two columns of ``R_w^T R_ref R_cur^T R_w``.
     """
-    quat = kin["wrist_quat"].unsqueeze(1)
-    pos = kin["wrist_pos"].unsqueeze(1)
-
-    def local(vectors: Tensor) -> Tensor:
-        return quat_rotate_inverse(quat.expand(*vectors.shape[:-1], 4), vectors)
-
-    tips = window["tip_pos"] - kin["tip_pos"].unsqueeze(1)
-    tips = quat_rotate_inverse(quat.unsqueeze(-2), tips).flatten(-2)
+    n, frames = vectors.shape[:2]
+    wrist = quat_to_matrix(kin["wrist_quat"])
+    linear, angular = own_vel.split(3, -1)
+    now = torch.stack([own_pos, linear, angular, kin["wrist_pos"]], -2)
+    now = torch.cat([now, kin["tip_pos"]], -2)
+    # (N, 2, K * 9, 3) @ (N, 2, 3, 3): a row vector times R_w is R_w^T v.
+    delta = (vectors - now.unsqueeze(1)).transpose(1, 2).flatten(2, 3) @ wrist
+    delta = delta.unflatten(2, (frames, 9))
+    # Columns of R_cur^T R_w for object and wrist; the wrist's is the identity.
+    turn = quat_to_matrix(quat_mul(quat_conj(own_quat), kin["wrist_quat"]))
+    columns = torch.stack([turn, torch.eye(3).to(turn).expand_as(turn)], 2)[..., :2]
+    # R_ref^T R_w of every frame, transposed back to R_w^T R_ref, then times columns.
+    turned = rotations.permute(0, 2, 3, 1, 4, 5).flatten(3, 4)
+    turned = (turned @ wrist.unsqueeze(2)).unflatten(3, (frames, 3)).mT
+    rot = (turned.flatten(3, 4) @ columns).unflatten(3, (frames, 3))
+    # Column 1 before column 2, as in quat_to_rot6d.
+    rot = rot.mT.flatten(-2)
     parts = [
-        local(window["own_pos"] - own_pos.unsqueeze(1)),
-        quat_to_rot6d(_relative_quat(quat, own_quat.unsqueeze(1), window["own_quat"])),
-        local(window["own_linvel"] - own_vel[..., :3].unsqueeze(1)),
-        local(window["own_angvel"] - own_vel[..., 3:].unsqueeze(1)),
-        local(window["wrist_pos"] - pos),
-        quat_to_rot6d(_relative_quat(quat, quat, window["wrist_quat"])),
-        tips,
+        delta[..., 0, :],
+        rot[:, :, 0],
+        delta[..., 1, :],
+        delta[..., 2, :],
+        delta[..., 3, :],
+        rot[:, :, 1],
+        delta[..., 4:, :].flatten(-2),
     ]
-    return torch.cat(parts, -1).permute(0, 2, 3, 1)
+    return torch.cat(parts, -1).transpose(-1, -2)
 
 
 def _relative_quat(wrist: Tensor, current: Tensor, reference: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from flashdex import keys
+from flashdex.geometry.rotation import quat_to_matrix
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
@@ -37,6 +38,7 @@ class ReferenceBank(nn.Module):
 
     Attributes:
         hand_active: hand takes part in the motion, (M, 2) bool.
+        used_hands: indices of the hands that any motion uses.
         hand_slot: object slot of each hand, 0 where it has none, (M, 2) int64.
         hand_object: object row of each hand, 0 where it has none, (M, 2) int64.
     """
@@ -53,9 +55,12 @@ class ReferenceBank(nn.Module):
         motion_of_frame = torch.repeat_interleave(torch.arange(len(start)), length)
         columns = self._columns(frames, slot[motion_of_frame], hands)
         self.register_buffer("table", self._pack(columns))
+        self.register_buffer("future", _pack_future(columns))
         self.register_buffer("start", start)
         self.register_buffer("length", length)
         self.register_buffer("hand_active", active)
+        # Hands that no motion of the collection uses cost nothing downstream.
+        self.used_hands = [i for i in range(2) if bool(active[:, i].any())]
         self.register_buffer("has_object", (slot >= 0) & active)
         self.register_buffer("hand_slot", slot.clamp_min(0))
         self.register_buffer("object_index", rows)
@@ -112,7 +117,7 @@ class ReferenceBank(nn.Module):
         }
         return TensorDict(out, batch_size=index.shape)
 
-    def window(self, motion: Tensor, frame: Tensor, horizon: int) -> TensorDict:
+    def window(self, motion: Tensor, frame: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
         """Gather ``horizon`` consecutive frames that begin at ``frame``.
 
         Args:
@@ -121,11 +126,18 @@ class ReferenceBank(nn.Module):
             horizon: number of frames K.
 
         Returns:
-            TensorDict of batch size (N, K) with the fields of the future window.
+            Vectors (N, K, 2, 9, 3): object position, linear and angular velocity, wrist
+            position, five fingertips; and the transposed rotation matrices of object and
+            wrist, (N, K, 2, 2, 3, 3). World frame.
         """
         steps = torch.arange(horizon, device=frame.device)
         frames = frame.unsqueeze(-1) + steps
-        return self.at(motion.unsqueeze(-1).expand_as(frames), frames, _WINDOW_FIELDS)
+        last = (self.length[motion] - 1).unsqueeze(-1)
+        index = self.start[motion].unsqueeze(-1) + torch.minimum(frames, last)
+        rows = self.future.index_select(0, index.reshape(-1))
+        rows = rows.unflatten(0, index.shape).unflatten(-1, (2, 45))
+        vectors, rotations = rows.split([27, 18], -1)
+        return vectors.unflatten(-1, (9, 3)), rotations.unflatten(-1, (2, 3, 3))
 
     def _columns(
         self, frames: TensorDict, slot: Tensor, hands: dict[str, HandSpec]
@@ -182,12 +194,11 @@ class ReferenceBank(nn.Module):
         return torch.cat(flat, -1).contiguous()
 
 
-_WINDOW_FIELDS = (
-    "own_pos",
-    "own_quat",
-    "own_linvel",
-    "own_angvel",
-    "wrist_pos",
-    "wrist_quat",
-    "tip_pos",
-)
+def _pack_future(columns: dict[str, Tensor]) -> Tensor:
+    """What the future window reads, side by side, (F, 2 * 45)."""
+    names = ("own_pos", "own_linvel", "own_angvel", "wrist_pos")
+    vectors = torch.stack([columns[n] for n in names], -2)
+    vectors = torch.cat([vectors, columns["tip_pos"]], -2)
+    quats = torch.stack([columns["own_quat"], columns["wrist_quat"]], -2)
+    rotations = quat_to_matrix(quats).mT
+    return torch.cat([vectors.flatten(2), rotations.flatten(2)], -1).flatten(1)

@@ -80,7 +80,8 @@ class SdfGrid(nn.Module):
         row = index.clamp_min(0)
         spacing = self.spacing[row][..., None]
         node = (points - self.origin[row]) / spacing
-        inside = node.clamp(0, self.resolution - 1)
+        # NaN (a diverged world) gives a NaN distance, not an index out of bounds.
+        inside = node.nan_to_num(nan=0.0).clamp(0, self.resolution - 1)
         value, slope = self._interpolate(row, inside)
         over = (node - inside) * spacing
         beyond = torch.linalg.vector_norm(over, dim=-1, keepdim=True)

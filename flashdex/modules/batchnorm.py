@@ -31,7 +31,9 @@ class _BatchNormRelu(torch.autograd.Function):
         return y, mean, var
 
     @staticmethod
-    def backward(ctx: Any, grad_y: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, grad_y: Tensor, *_: Tensor
+    ) -> tuple[Tensor | None, ...]:
         centred, y, gamma, rstd = ctx.saved_tensors
         grad = torch.ops.aten.threshold_backward(grad_y, y, 0)
         grad_beta = grad.sum(1)

@@ -111,6 +111,9 @@ class UnitBatchNorm(nn.Module):
         ensemble: number of members E.
     """
 
+    running_mean: Tensor
+    running_var: Tensor
+
     def __init__(
         self,
         features: int,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -41,8 +42,12 @@ class FlashPolicy(TensorDictModuleBase):
         self.actor = actor
         self.noise = NoiseRepetition() if noise is None else noise
         self.has_future = actor.future_encoder is not None
-        self.in_keys = [observation, future] if self.has_future else [observation]
-        self.out_keys = [action] if groups is None else [(g, action) for g in groups]
+        reads: list[Any] = [observation, future]
+        writes: list[Any] = [action]
+        if groups is not None:
+            writes = [(group, action) for group in groups]
+        self.in_keys = reads if self.has_future else reads[:1]
+        self.out_keys = writes
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

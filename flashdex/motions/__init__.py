@@ -1,0 +1,1 @@
+"""Recordings in, motion libraries out: readers, retargeting, objects, checks."""

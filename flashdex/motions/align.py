@@ -18,7 +18,7 @@ from flashdex.motions.contacts import (
 )
 from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
-from flashdex.motions.meshes import load_mesh
+from flashdex.motions.meshes import clean_mesh, load_mesh
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import (
     continuous,
@@ -116,9 +116,10 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
 
 
 def _mesh(body: DemoObject) -> trimesh.Trimesh:
-    if isinstance(body.mesh, trimesh.Trimesh):
-        return body.mesh
-    return load_mesh(Path(body.mesh))
+    mesh = body.mesh
+    if not isinstance(mesh, trimesh.Trimesh):
+        mesh = load_mesh(Path(mesh))
+    return clean_mesh(mesh, name=body.name)
 
 
 def _hands(

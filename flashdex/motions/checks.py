@@ -159,7 +159,7 @@ def _tip_depth(aligned: AlignedDemo, sdf: SdfGrid) -> float:
         tips = aligned.keypoints[:, hand][:, TIP_KEYPOINTS] - pose[:, None, :3]
         local = np.einsum("tji,tkj->tki", rotation(pose[:, 3:]).as_matrix(), tips)
         distance, _ = sdf.query(torch.tensor(local), torch.tensor(slot))
-        near = distance.numpy()[aligned.tip_dist[:, hand] < CONTACT_NEAR]
+        near = distance[distance < CONTACT_NEAR].numpy()
         depths.append(np.maximum(-near, 0) if near.size else np.zeros(1))
     return float(max(np.quantile(d, 0.98) for d in depths))
 

@@ -35,7 +35,7 @@ def solid_values(asset: ObjectAsset) -> np.ndarray:
     """Signed distance to the union of a mesh and its convex parts at grid nodes.
 
     Convex parts fill handles and hollows. Outside of all of them the distance is exact;
-    inside, the depth is that of the part one is deepest in, min_k max_i (n_i . p + d_i).
+    inside, it is the depth in the part one is deepest in, min_k max_i (n_i . p + d_i).
 
     Args:
         asset: the object.

@@ -38,10 +38,11 @@ class FlashBatch(NamedTuple):
 
     def split(self) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
         """``observation, next_observation, future, next_future``."""
-        now, after = self.observation.split(self.size)
+        size = self.size
+        now, after = self.observation[:size], self.observation[size:]
         if self.future is None:
             return now, after, None, None
-        return now, after, *self.future.split(self.size)
+        return now, after, self.future[:size], self.future[size:]
 
 
 def nested(group: str | None, key: NestedKey) -> NestedKey:

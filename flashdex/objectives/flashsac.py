@@ -54,7 +54,7 @@ class FlashSACLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(LossModule._AcceptedKeys):
         observation: NestedKey = "observation"
         future: NestedKey = "future"
         action: NestedKey = "action"
@@ -64,7 +64,7 @@ class FlashSACLoss(LossModule):
         group_mask: NestedKey = "group_mask"
 
     default_keys = _AcceptedKeys
-    out_keys = ("loss_actor", "loss_alpha", "loss_qvalue")
+    tensor_keys: _AcceptedKeys  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __init__(
         self,
@@ -80,6 +80,7 @@ class FlashSACLoss(LossModule):
         exact_discount: bool = True,
     ) -> None:
         super().__init__()
+        self.out_keys = ["loss_actor", "loss_alpha", "loss_qvalue"]
         self.groups: tuple[str | None, ...] = (None,) if groups is None else (*groups,)
         counts = {actor_network.num_groups, qvalue_network.num_groups}
         if counts != {len(self.groups)}:
@@ -101,7 +102,7 @@ class FlashSACLoss(LossModule):
         self.target_entropy = target_entropy(actor_network.action_dim, target_sigma)
 
     @property
-    def functional(self) -> bool:
+    def functional(self) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
         """False: the networks are plain submodules with a mode argument."""
         return False
 
@@ -119,7 +120,7 @@ class FlashSACLoss(LossModule):
                 yield name, parameter
 
     @property
-    def in_keys(self) -> list[NestedKey]:
+    def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Entries that every batch must hold."""
         keys = self.tensor_keys
         names = [keys.observation, nested("next", keys.observation)]
@@ -205,7 +206,7 @@ class FlashSACLoss(LossModule):
         noise = self._noise(tensordict, noise)
         return self.qvalue_objective(self.read(tensordict), noise)
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """All losses at the present parameters (interface only, see the class)."""
         actor, actor_metrics = self.actor_loss(tensordict)

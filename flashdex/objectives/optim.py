@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 def cosine_rate(step: int, total: int | None, *, peak: float, end: float) -> float:
@@ -83,11 +84,11 @@ class TargetAverage:
     """
 
     def __init__(self, source: nn.Module, target: nn.Module, *, tau: float) -> None:
-        self.tau = tau
-        self.source: Sequence[Tensor] = [p.detach() for p in source.parameters()]
-        self.target: Sequence[Tensor] = [p.detach() for p in target.parameters()]
+        self.source = [p.detach() for p in source.parameters()]
+        self.target = [p.detach() for p in target.parameters()]
+        self._average = get_ema_multi_avg_fn(1.0 - tau)
 
     @torch.no_grad()
     def step(self) -> None:
         """Move the target one step."""
-        torch._foreach_lerp_(self.target, self.source, self.tau)
+        self._average(self.target, self.source, None)

@@ -26,9 +26,6 @@ from flashdex.recipe import AlgoConfig
 from flashdex.training.nstep import NStepAssembler
 from flashdex.training.rows import RowCodec
 
-GROUPS = {"per_hand": ("left", "right"), "unified": ("both",)}
-
-
 class Learner:
     """Acts, remembers and learns; knows states and actions, but no simulator.
 
@@ -52,7 +49,11 @@ class Learner:
         seed: int,
     ) -> None:
         self.config, self.bank = config, bank
-        self.groups = GROUPS[config.groups]
+        # A hand that no motion uses needs no actor and no critic.
+        self.hands = bank.used_hands
+        self.unified = config.groups == "unified" and len(self.hands) == 2
+        used = tuple(keys.SIDES[i] for i in self.hands)
+        self.groups = ("both",) if self.unified else used
         self.transforms = transforms
         self.sample_transforms = [t.clone() for t in transforms]
         self.generator = torch.Generator().manual_seed(seed)
@@ -60,7 +61,7 @@ class Learner:
         num_envs = example.batch_size[0]
         shown = assemble(transforms, example)
         joints = bank.num_joints
-        self.action_dim = joints if len(self.groups) == 2 else 2 * joints
+        self.action_dim = 2 * joints if self.unified else joints
         actor, critic = self._networks(shown)
         self.normalizer = RewardNormalizer(
             num_envs, len(self.groups), gamma=config.gamma, bound=config.v_max
@@ -160,13 +161,15 @@ class Learner:
             with set_exploration_type(ExplorationType.RANDOM):
                 noisy = self._joint(self.policy(shown.copy()))
         else:
-            draw = torch.rand(quiet.shape, generator=self.generator)
-            noisy = 2 * draw - 1
+            noisy = 2 * torch.rand(quiet.shape, generator=self.generator) - 1
         return torch.where(state[keys.ATTEMPT].unsqueeze(-1), quiet, noisy)
 
     def _joint(self, td: TensorDictBase) -> Tensor:
-        actions = [td[g, keys.ACTION] for g in self.groups]
-        return torch.cat(actions, -1).unflatten(-1, (2, -1))
+        actions = torch.cat([td[g, keys.ACTION] for g in self.groups], -1)
+        actions = actions.unflatten(-1, (len(self.hands), -1))
+        joint = actions.new_zeros(len(actions), 2, actions.shape[-1])
+        joint[:, self.hands] = actions
+        return joint
 
     def remember(
         self,
@@ -188,10 +191,11 @@ class Learner:
             done: (N, 1) bool.
         """
         mask = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
-        if len(self.groups) == 1:
+        if self.unified:
             self.normalizer.update(reward.sum(-1, keepdim=True), done)
         else:
-            self.normalizer.update(reward, done, mask)
+            used = self.hands
+            self.normalizer.update(reward[:, used], done, mask[:, used])
         row = self.nstep.push(
             state.select(*keys.STATE),
             action,
@@ -214,13 +218,18 @@ class Learner:
         now, after = shown.select(*wanted).split(size)
         after = after.set(keys.TERMINATED, transition[keys.TERMINATED])
         batch = now.set("next", after).set(keys.STEPS, transition[keys.STEPS])
-        action = transition[keys.ACTION].split(self.action_dim, -1)
         reward = transition[keys.REWARD]
-        if len(self.groups) == 1:
+        if self.unified:
             reward = reward.sum(-1, keepdim=True)
+            actions = [transition[keys.ACTION]]
             batch.set(keys.GROUP_MASK, torch.ones_like(reward, dtype=torch.bool))
+        else:
+            both = transition[keys.ACTION].split(self.action_dim, -1)
+            actions = [both[i] for i in self.hands]
+            reward = reward[:, self.hands]
+            batch.set(keys.GROUP_MASK, batch[keys.GROUP_MASK][:, self.hands])
         for i, group in enumerate(self.groups):
-            batch.set((group, keys.ACTION), action[i])
+            batch.set((group, keys.ACTION), actions[i])
             batch.set(("next", group, keys.REWARD), reward[:, i : i + 1])
         return batch
 

@@ -73,6 +73,7 @@ class Ledger:
 
     def _read(self) -> None:
         """Take up the lines of an earlier session of the same run."""
+        drop_cut_line(self.path)
         for line in read_lines(self.path):
             self._count(line)
 
@@ -209,6 +210,21 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
             if number < len(lines) - 1:
                 raise
     return out
+
+
+def drop_cut_line(path: Path) -> None:
+    """Remove a last line that a crash cut off, or the next one would join it.
+
+    Args:
+        path: JSONL file; need not exist.
+    """
+    if not path.is_file():
+        return
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        with path.open("r+b") as file:
+            file.truncate(whole)
 
 
 def write_atomic(path: Path, text: str) -> None:

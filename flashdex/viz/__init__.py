@@ -1,0 +1,1 @@
+"""Pictures out: charts, films, the report page and tables for the terminal."""

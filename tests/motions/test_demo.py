@@ -106,4 +106,6 @@ def test_cut_keeps_the_rest(still_demo):
     piece.validate()
     assert piece.num_frames == 20
     assert piece.name == "piece"
-    np.testing.assert_array_equal(piece.objects[0].pose, still_demo.objects[0].pose[5:25])
+    np.testing.assert_array_equal(
+        piece.objects[0].pose, still_demo.objects[0].pose[5:25]
+    )

@@ -88,8 +88,9 @@ def test_round_trip(records, assets, tmp_path):
         for saved, part in zip(library.parts(row), asset.parts, strict=True):
             np.testing.assert_allclose(saved, part, atol=1e-7)
         np.testing.assert_array_equal(library.objects["points"][row], asset.points)
-        assert library.visual(row).volume == pytest.approx(np.prod(
-            asset.aabb[1] - asset.aabb[0]), rel=1e-4)
+        assert library.visual(row).volume == pytest.approx(
+            np.prod(asset.aabb[1] - asset.aabb[0]), rel=1e-4
+        )
 
 
 def test_index_clamps_like_brute_force(records, tmp_path):
@@ -154,8 +155,9 @@ import test_library as t
 from flashdex.motions import library_writer
 from flashdex.motions.objects import ObjectSettings, make_object
 import trimesh
-box = make_object(trimesh.creation.box((.04, .05, .06)), name="box",
-                  settings=ObjectSettings(sdf_resolution=12), cache_dir=Path(sys.argv[3]))
+coarse = ObjectSettings(sdf_resolution=12)
+mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+box = make_object(mesh, name="box", settings=coarse, cache_dir=Path(sys.argv[3]))
 def stall(*_):
     Path(sys.argv[3], "reached").touch()
     time.sleep(60)

@@ -18,17 +18,23 @@ AXIS = np.array([1.0, 2.0, -2.0]) / 3
 
 
 def spin(times, rate):
-    quats = Rotation.from_rotvec(rate * times[:, None] * AXIS).as_quat(scalar_first=True)
+    quats = Rotation.from_rotvec(rate * times[:, None] * AXIS).as_quat(
+        scalar_first=True
+    )
     return quats * np.where(np.arange(len(times)) % 2, -1, 1)[:, None]
 
 
 def test_resampled_pose_is_the_closed_form():
     source = np.arange(31) / 30
-    pose = np.concatenate([np.outer(source, [1.0, -2.0, 0.5]), spin(source, 2.0)], axis=1)
+    pose = np.concatenate(
+        [np.outer(source, [1.0, -2.0, 0.5]), spin(source, 2.0)], axis=1
+    )
     times = sample_times(31, 30.0, 50.0)
     assert len(times) == 51
     out = resample_pose(pose, 30.0, times)
-    np.testing.assert_allclose(out[:, :3], np.outer(times, [1.0, -2.0, 0.5]), atol=1e-12)
+    np.testing.assert_allclose(
+        out[:, :3], np.outer(times, [1.0, -2.0, 0.5]), atol=1e-12
+    )
     wanted = Rotation.from_rotvec(2.0 * times[:, None] * AXIS)
     got = Rotation.from_quat(out[:, 3:], scalar_first=True)
     assert (got * wanted.inv()).magnitude().max() < 1e-7

@@ -30,11 +30,14 @@ class ReferenceDelta(Block):
 
     Args:
         name: key under ``blocks``.
+        used_hands: indices of the hands to keep.
         hands: specs of both sides, for the mapped links.
     """
 
-    def __init__(self, name: str, hands: dict[str, HandSpec]) -> None:
-        super().__init__(name)
+    def __init__(
+        self, name: str, used_hands: list[int], hands: dict[str, HandSpec]
+    ) -> None:
+        super().__init__(name, used_hands)
         links = [[link for link, _ in hands[s].keypoint_links] for s in keys.SIDES]
         self.register_buffer("links", torch.tensor(links))
 
@@ -69,7 +72,7 @@ class ObjectPoints(Block):
     needs_object = True
 
     def __init__(self, name: str, bank: ReferenceBank, *, num_points: int) -> None:
-        super().__init__(name)
+        super().__init__(name, bank.used_hands)
         self.register_buffer("points", bank.points[:, :num_points])
 
     def features(self, td: TensorDictBase) -> Tensor:
@@ -95,7 +98,7 @@ class SurfaceDistance(Block):
     def __init__(
         self, name: str, bank: ReferenceBank, hands: dict[str, HandSpec]
     ) -> None:
-        super().__init__(name)
+        super().__init__(name, bank.used_hands)
         self.sdf = bank.sdf
         radii = [torch.as_tensor(hands[s].tip_radius) for s in keys.SIDES]
         self.register_buffer("tip_radius", torch.stack(radii).float())
@@ -120,7 +123,7 @@ class Contact(Block):
 
 
 class FutureWindow(StateTransform):
-    """Coming reference frames, (N, 78, K), the input of the future encoder.
+    """Coming reference frames, (N, 39 x hands, K), the input of the future encoder.
 
     Args:
         bank: reference frames.
@@ -143,12 +146,12 @@ class FutureWindow(StateTransform):
         """See ``features.future_window``."""
         motion = td[keys.MOTION].squeeze(-1)
         frame = td[keys.FRAME].squeeze(-1) + self.reference_offset
-        window = self.bank.window(motion, frame, self.horizon)
+        vectors, rotations = self.bank.window(motion, frame, self.horizon)
         own = td["own"]
         values = features.future_window(
-            td[keys.KIN], window, own["pos"], own["quat"], own["vel"]
+            td[keys.KIN], vectors, rotations, own["pos"], own["quat"], own["vel"]
         )
         mask = td[keys.GROUP_MASK][..., None, None]
         values = torch.where(mask, values, torch.zeros_like(values))
         values = torch.nan_to_num(values).clamp(-100.0, 100.0)
-        return {keys.FUTURE: values.flatten(1, 2)}
+        return {keys.FUTURE: values[:, self.bank.used_hands].flatten(1, 2)}

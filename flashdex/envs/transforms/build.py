@@ -57,17 +57,17 @@ def _make_block(
 ) -> Transform:
     match name:
         case "proprioception":
-            return blocks.Proprioception(name)
+            return blocks.Proprioception(name, bank.used_hands)
         case "reference_delta":
-            return blocks.ReferenceDelta(name, hands)
+            return blocks.ReferenceDelta(name, bank.used_hands, hands)
         case "object_state":
-            return blocks.ObjectState(name)
+            return blocks.ObjectState(name, bank.used_hands)
         case "object_points":
             return blocks.ObjectPoints(name, bank, num_points=options.num_points)
         case "surface_distance":
             return blocks.SurfaceDistance(name, bank, hands)
         case "contact":
-            return blocks.Contact(name)
+            return blocks.Contact(name, bank.used_hands)
         case _:
             msg = f"transform '{name}' has options but no implementation"
             raise AssertionError(msg)

@@ -80,23 +80,25 @@ class TrackingContext(StateTransform):
 
 
 class Block(StateTransform):
-    """A named part of the observation: features of both hands, side by side.
+    """A named part of the observation: features of the hands, side by side.
 
     Subclasses write ``features`` (N, 2, D); hands without a part in the motion and,
-    where ``needs_object`` is set, hands without an object get zeros.
+    where ``needs_object`` is set, hands without an object get zeros. A hand that no
+    motion of the collection uses is left out.
 
     Args:
         name: key under ``blocks``.
+        used_hands: indices of the hands to keep.
     """
 
     needs_object = False
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, used_hands: list[int]) -> None:
         super().__init__(
             in_keys=[keys.KIN, keys.REF, "own", keys.GROUP_MASK],
             out_keys=[(keys.BLOCKS, name)],
         )
-        self.name = name
+        self.name, self.used_hands = name, used_hands
 
     def features(self, td: TensorDictBase) -> Tensor:
         """Features of both hands, (N, 2, D)."""
@@ -109,7 +111,7 @@ class Block(StateTransform):
         if self.needs_object:
             mask = mask & td["own", "present"]
         values = torch.where(mask, values, torch.zeros_like(values))
-        return {(keys.BLOCKS, self.name): values.flatten(1)}
+        return {(keys.BLOCKS, self.name): values[:, self.used_hands].flatten(1)}
 
 
 class ConcatBlocks(StateTransform):

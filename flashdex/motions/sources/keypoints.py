@@ -2,7 +2,8 @@
 
 Keys: ``fps``, ``object`` (the mesh is ``meshes/<object>.obj`` beside the file),
 ``obj_pose`` (T, 7), and per recorded hand ``kp_left`` (T, 21, 3) and, if known,
-``palm_left`` (T, 7); right likewise. Metres, quaternions wxyz, z up. ``segments*.json`` beside the files cuts
+``palm_left`` (T, 7); right likewise. Metres, quaternions wxyz, z up. A
+``segments*.json`` beside the files (a list of clip, start, end; end excluded) cuts
 recordings into motions called ``<clip>_<start>_<end>``.
 """
 
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
+from flashdex.motions.demo import SIDES, DemoObject, HumanDemo, Side
 from flashdex.motions.meshes import load_mesh
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
@@ -85,9 +86,13 @@ def read_file(file: Path) -> HumanDemo:
     )
 
 
-def _palm(data: dict, side: str, keypoints: dict) -> np.ndarray:
-    stored = data.get(f"palm_{side}")
-    return palm_frame(keypoints[side], side) if stored is None else np.float64(stored)
+def _palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.ndarray:
+    stored, points = data.get(f"palm_{side}"), keypoints[side]
+    if stored is not None:
+        return stored.astype(np.float64)
+    if points.ndim != 3 or points.shape[1:] != (21, 3) or not np.isfinite(points).all():
+        return np.full((len(points), 7), np.nan)  # validation says what is wrong
+    return palm_frame(points, side)
 
 
 def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
@@ -108,12 +113,7 @@ def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
 
 def _cut(demo: HumanDemo, pieces: list[tuple[int, int]]) -> list[HumanDemo]:
     """Pieces of a recording; they share the table that the whole recording shows."""
-    demo.validate()
-    meshes = [load_mesh(Path(b.mesh)) for b in demo.objects]
-    vertices = [np.asarray(m.vertices) for m in meshes]
-    poses = [b.pose for b in demo.objects]
-    height, found = estimate_support(poses, vertices, demo.fps)
-    demo.support_z = height if found else None
+    demo.support_z = _support(demo)
     for start, end in pieces:
         if not 0 <= start < end <= demo.num_frames:
             raise DemoError(
@@ -121,3 +121,14 @@ def _cut(demo: HumanDemo, pieces: list[tuple[int, int]]) -> list[HumanDemo]:
                 f"{demo.num_frames} frames."
             )
     return [demo.cut(a, b, name=f"{demo.name}_{a}_{b}") for a, b in pieces]
+
+
+def _support(demo: HumanDemo) -> float | None:
+    try:
+        demo.validate()
+    except DemoError:
+        return None  # each piece is validated on its own; some may be sound
+    vertices = [np.asarray(load_mesh(Path(b.mesh)).vertices) for b in demo.objects]
+    poses = [b.pose for b in demo.objects]
+    height, found = estimate_support(poses, vertices, demo.fps)
+    return height if found else None

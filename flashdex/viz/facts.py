@@ -1,0 +1,218 @@
+"""What a run says about each motion: the rows behind every table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from flashdex.errors import UnknownNameError
+from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
+from flashdex.viz.run_data import Line, RunData
+
+SIDES = ("left", "right")
+PROVEN = ("certified", "robust")
+# quantity -> (heading, unit, factor from m or rad)
+SHOWN = {
+    "object_pos": ("object", "mm", 1e3),
+    "object_pos_centred": ("object centred", "mm", 1e3),
+    "object_rot": ("object", "deg", 57.29577951308232),
+    "fingertip": ("fingertips", "mm", 1e3),
+    "joint": ("joints", "mm", 1e3),
+    "wrist_pos": ("wrists", "mm", 1e3),
+}
+
+
+@dataclass(frozen=True)
+class MotionFacts:
+    """One row of the per-motion table.
+
+    Args:
+        name: motion id.
+        hands: hands that take part, as far as the files tell.
+        attempts: scored rollouts from frame 0.
+        failed: attempts that did not pass.
+        first: ledger line of the first conversion, or None.
+        errors: of the first conversion, else of the best complete attempt; m and rad.
+        completed: attempts that reached the end of the motion.
+        furthest: last frame that any attempt reached, -1 without attempts.
+        causes: (cause, hand) of failed attempts with their numbers, most first.
+        baselines: baseline -> its score of this motion.
+        trivial: baselines that pass already.
+        certificate: of the stored rollout, or empty.
+    """
+
+    name: str
+    hands: tuple[str, ...]
+    attempts: int
+    failed: int
+    first: Line | None
+    errors: dict[str, float]
+    completed: int
+    furthest: int
+    causes: list[tuple[tuple[str, str], int]]
+    baselines: dict[str, Line]
+    trivial: tuple[str, ...]
+    certificate: Line = field(default_factory=dict)
+
+    @property
+    def is_converted(self) -> bool:
+        """At least one attempt passed."""
+        return self.first is not None
+
+    @property
+    def verdict(self) -> str:
+        """Word of the certificate; ``none`` for a conversion without one."""
+        if self.first is None:
+            return ""
+        found = self.certificate.get("verdict") or self.first.get("verdict")
+        return str(found or "none")
+
+    @property
+    def robust_share(self) -> float | None:
+        """Share of perturbed replays that passed."""
+        name = self.certificate.get("identity", {}).get("criterion")
+        return self.certificate.get("perturbed", {}).get("pass_fraction", {}).get(name)
+
+    @property
+    def penetration_mm(self) -> float | None:
+        """Largest penetration of the replay."""
+        return self.certificate.get("safety", {}).get("penetration_max_mm")
+
+    @property
+    def force(self) -> float | None:
+        """Largest normal force of the replay, N."""
+        return self.certificate.get("safety", {}).get("force_peak")
+
+    @property
+    def why(self) -> str:
+        """Most frequent cause of failure with its share of the failed attempts."""
+        if not self.causes:
+            return "" if self.attempts else "not attempted"
+        (cause, hand), count = self.causes[0]
+        share = f"{count / self.failed:.0%}"
+        return " ".join(word for word in (cause, hand, share) if word)
+
+    @property
+    def failures(self) -> str:
+        """:attr:`why`, and how far the motion came if no attempt reached its end."""
+        if self.is_converted or self.completed or not self.attempts:
+            return self.why
+        return f"{self.why}; never completed, furthest frame {self.furthest}"
+
+
+def motion_facts(run: RunData) -> list[MotionFacts]:
+    """Rows of all motions the files name, in the order of the collection.
+
+    Args:
+        run: the files.
+    """
+    scored = (m for rows in run.baselines.values() for m in rows)
+    names = dict.fromkeys([*scored, *(line["motion"] for line in run.attempts)])
+    lines: dict[str, list[Line]] = {name: [] for name in names}
+    for line in run.attempts:
+        lines[line["motion"]].append(line)
+    return [_facts(run, name, lines[name]) for name in names]
+
+
+def _facts(run: RunData, name: str, lines: list[Line]) -> MotionFacts:
+    first = next((line for line in lines if line.get("converted")), None)
+    scores = {b: rows[name] for b, rows in run.baselines.items() if name in rows}
+    passing = [b for b, row in scores.items() if run.criterion in row.get("passed", [])]
+    named = [b for line in lines for b in line.get("trivial") or []]
+    failed = [line for line in lines if not line.get("converted")]
+    causes = Counter(cause for line in failed for cause in _why(line))
+    return MotionFacts(
+        name=name,
+        hands=_hands([*lines, *scores.values()]),
+        attempts=len(lines),
+        failed=len(failed),
+        first=first,
+        errors=first["errors"] if first else _best([li.get("errors") for li in lines]),
+        completed=sum(bool(line.get("completed")) for line in lines),
+        furthest=max((line.get("frame", -1) for line in lines), default=-1),
+        causes=causes.most_common(),
+        baselines=scores,
+        trivial=tuple(dict.fromkeys([*passing, *named])),
+        certificate=run.certificates.get(name, {}) if first else {},
+    )
+
+
+def _why(line: Line) -> set[tuple[str, str]]:
+    """Causes of one attempt, each counted once."""
+    return {
+        (str(w.get("cause", "")), str(w.get("hand", ""))) for w in line.get("why", [])
+    }
+
+
+def _hands(lines: Iterable[Line]) -> tuple[str, ...]:
+    """Hands that a per-hand criterion or a cause names: an absent hand has neither."""
+    found: set[str] = set()
+    for line in lines:
+        found.update(line.get("hands", []))
+        found.update(hand for _, hand in _why(line))
+        found.update(name.rpartition("_")[2] for name in line.get("passed", []))
+    return tuple(side for side in SIDES if side in found)
+
+
+def _best(errors: Iterable[dict[str, float] | None]) -> dict[str, float]:
+    """Smallest object error: 30 degrees weigh as much as 3 cm, as in the ledger."""
+
+    def size(one: dict[str, float]) -> float:
+        return one.get("object_pos", 9.0) + 0.0573 * one.get("object_rot", 9.0)
+
+    return min((e for e in errors if e), key=size, default={})
+
+
+def criterion_terms(criterion: str) -> tuple[Term, ...]:
+    """Signals and limits of a criterion; empty for one this version does not know.
+
+    Args:
+        criterion: its name.
+    """
+    try:
+        name = resolve_criterion(criterion)
+    except UnknownNameError:
+        return ()
+    return next((c.terms for c in make_criteria() if c.name == name), ())
+
+
+def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
+    """Motions of the collection; those without baseline and attempt are counted too.
+
+    Args:
+        run: the files.
+        facts: rows of the known motions.
+    """
+    for record in reversed(run.metrics):
+        rate = record.get("convert/rate", 0.0)
+        if rate > 0:
+            return max(len(facts), round(record["convert/cumulative"] / rate))
+    return len(facts)
+
+
+def count(facts: list[MotionFacts]) -> dict[str, int]:
+    """Converted motions, and how many of them are certified, robust, trivial.
+
+    Args:
+        facts: rows.
+    """
+    converted = [f for f in facts if f.is_converted]
+    return {
+        "converted": len(converted),
+        "certified": sum(f.verdict in PROVEN for f in converted),
+        "robust": sum(f.verdict == "robust" for f in converted),
+        "trivial": sum(bool(f.trivial) for f in converted),
+        "attempts": sum(f.attempts for f in facts),
+    }
+
+
+def in_unit(quantity: str, value: Any) -> float | None:
+    """Convert m or rad to the unit that is shown; None stays None.
+
+    Args:
+        quantity: a key of ``SHOWN``.
+        value: m or rad.
+    """
+    return None if value is None else float(value) * SHOWN[quantity][2]

@@ -1,0 +1,122 @@
+"""Films of the conversions of a run: drawn once, in a process that can draw."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+_LOG = logging.getLogger(__name__)
+FOLDER = "films"
+NO_GRAPHICS = "no pictures: install libosmesa6 or libegl1"
+_SECONDS_A_FILM = 120
+_PROBE = (
+    "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco><worldbody>"
+    '<geom size=".1"/></worldbody></mujoco>\'); r = mujoco.Renderer(m, 16, 16); '
+    "d = mujoco.MjData(m); mujoco.mj_forward(m, d); r.update_scene(d); r.render()"
+)
+
+
+@dataclass(frozen=True)
+class Film:
+    """Files of one drawn rollout.
+
+    Args:
+        video: mp4.
+        stills: pictures side by side, png.
+        poster: first picture, png.
+    """
+
+    video: Path
+    stills: Path
+    poster: Path
+
+    @classmethod
+    def of(cls, rollout: Path) -> Film:
+        """Where the pictures of a stored rollout lie.
+
+        Args:
+            rollout: ``rollouts/<motion>.npz`` of a run.
+        """
+        base = rollout.parent.parent / FOLDER / rollout.stem
+        return cls(
+            *(base.with_name(base.name + e) for e in (".mp4", ".png", "_poster.png"))
+        )
+
+    def is_newer_than(self, rollout: Path) -> bool:
+        """All files exist and were drawn after the rollout was stored.
+
+        Args:
+            rollout: the stored file.
+        """
+        files = (self.video, self.stills, self.poster)
+        stored = rollout.stat().st_mtime
+        return all(f.is_file() and f.stat().st_mtime >= stored for f in files)
+
+
+def draw_films(rollouts: list[Path]) -> str:
+    """Draw what is not drawn yet.
+
+    Args:
+        rollouts: stored rollouts of one run.
+
+    Returns:
+        Why pictures are missing, empty when all are there. Never raises: a run is worth
+        reporting without pictures.
+    """
+    todo = [r for r in rollouts if r.is_file() and not Film.of(r).is_newer_than(r)]
+    if not todo:
+        return ""
+    backend = find_backend()
+    if backend is None:
+        return NO_GRAPHICS
+    _LOG.info("drawing %d films", len(todo))
+    folder = Film.of(todo[0]).video.parent
+    words = ["-m", "flashdex.viz.frames", *map(str, todo), str(folder)]
+    fault = _run(words, backend, timeout=60 + _SECONDS_A_FILM * len(todo))
+    missing = [r.stem for r in todo if not Film.of(r).is_newer_than(r)]
+    if not missing:
+        return ""
+    return f"no pictures of {', '.join(missing)}: {fault or 'unknown fault'}"
+
+
+@functools.cache
+def find_backend() -> str | None:
+    """First value of MUJOCO_GL that draws on this computer; what the user set wins."""
+    asked = os.environ.get("MUJOCO_GL")
+    usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("glfw",)
+    for backend in (asked,) if asked else usual:
+        if not _run(["-c", _PROBE], backend, timeout=60):
+            return backend
+    return None
+
+
+def _run(words: list[str], backend: str, *, timeout: float) -> str:
+    """Run Python with a graphics back end; return what went wrong, in one line."""
+    package = Path(__file__).parents[2]
+    paths = [str(package), os.environ.get("PYTHONPATH", "")]
+    environment = {
+        **os.environ,
+        "MUJOCO_GL": backend,
+        "PYOPENGL_PLATFORM": backend,
+        "PYTHONPATH": os.pathsep.join(p for p in paths if p),
+    }
+    try:
+        done = subprocess.run(
+            [sys.executable, *words],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    if done.returncode == 0:
+        return ""
+    lines = done.stderr.strip().splitlines()
+    return lines[-1] if lines else f"exit code {done.returncode}"

@@ -1,0 +1,243 @@
+"""Plain-text tables for the terminal, at most 100 columns wide."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flashdex.metrics.verdict import Verdict
+from flashdex.viz.facts import (
+    SHOWN,
+    MotionFacts,
+    count,
+    criterion_terms,
+    in_unit,
+    motion_facts,
+    num_motions,
+)
+from flashdex.viz.html import duration, number
+from flashdex.viz.run_data import RunData, load_run
+
+MAX_WIDTH = 100
+NAME_WIDTH = 20
+BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
+HEADINGS = ("motion", "hand", "tries", "steps", "min", "mm", "deg")
+PROOF = ("proof", "pert", "pen", "N")
+STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
+
+
+def run_table(run_dir: str | Path) -> str:
+    """The facts of ``report.html`` for a terminal.
+
+    Args:
+        run_dir: run directory.
+    """
+    run = load_run(run_dir)
+    rows = motion_facts(run)
+    names = list(run.baselines)[: len(BASELINES)]
+    cells = [[*HEADINGS, *PROOF, *(BASELINES.get(b, b)[:8] for b in names)]]
+    cells += [_cells(row, names) for row in rows]
+    lines = align(cells) if rows else ["no motion has been attempted yet"]
+    out = [*_headline(run, rows), "", *lines, "", *_failures(rows), *_legend(run)]
+    return "\n".join(line[:MAX_WIDTH].rstrip() for line in out)
+
+
+def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
+    counts, recipe = count(rows), run.recipe
+    converted = counts["converted"]
+    return [
+        f"{recipe.get('name', run.path.name)}  hand {recipe.get('hand', '?')}  "
+        f"engine {recipe.get('physics', {}).get('engine', '?')}  "
+        f"seed {recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
+        f"{duration(run.wall_s)}",
+        f"{converted}/{num_motions(run, rows)} converted by {run.criterion}, "
+        f"{counts['certified']} certified ({counts['robust']} robust), "
+        f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
+    ]
+
+
+def _cells(row: MotionFacts, baselines: list[str]) -> list[str]:
+    first = row.first or {}
+    share = row.robust_share
+    return [
+        shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
+        "+".join(side[0].upper() for side in row.hands) or "-",
+        str(row.attempts),
+        short(first["env_steps"]) if first else "-",
+        plain(first["wall_s"] / 60) if first else "-",
+        _error(row.errors, "object_pos"),
+        _error(row.errors, "object_rot"),
+        row.verdict or "-",
+        "-" if share is None else f"{share:.0%}",
+        plain(row.penetration_mm),
+        plain(row.force, 0),
+        *(_baseline(row.baselines.get(name)) for name in baselines),
+    ]
+
+
+def _error(errors: Mapping[str, float], quantity: str) -> str:
+    centred = f"{quantity}_centred"
+    value = errors.get(quantity, errors.get(centred))
+    return plain(in_unit(quantity, value))
+
+
+def _baseline(score: Mapping[str, Any] | None) -> str:
+    errors = (score or {}).get("errors", {})
+    pair = [
+        plain(in_unit(q, errors.get(q, errors.get(f"{q}_centred"))), 0)
+        for q in ("object_pos", "object_rot")
+    ]
+    return "/".join(pair)
+
+
+def _failures(rows: list[MotionFacts]) -> list[str]:
+    failed = [row for row in rows if not row.is_converted]
+    if not failed:
+        return []
+    width = max(min(len(row.name), NAME_WIDTH) for row in failed)
+    lines = [f"  {shorten(r.name, width):<{width}}  {r.failures}" for r in failed]
+    return ["not converted:", *lines, ""]
+
+
+def _legend(run: RunData) -> list[str]:
+    limits = [
+        f"{SHOWN[term.quantity][0]} {in_unit(term.quantity, term.limit):g} "
+        f"{SHOWN[term.quantity][1]}"
+        for term in criterion_terms(run.criterion)
+    ]
+    lines = [
+        f"limits of {run.criterion}: {', '.join(limits) or 'none'}",
+        "pert: share of perturbed replays that pass; pen: deepest contact, mm; "
+        "N: largest force",
+    ]
+    if run.baselines:
+        lines.append(
+            "idle, playback: baselines without learning, mm/deg; *: one passes"
+        )
+    return lines
+
+
+def evaluation_table(
+    rows: Sequence[Mapping[str, Any]], totals: Mapping[str, Any]
+) -> str:
+    """Scores of ``flashdex evaluate`` for a terminal.
+
+    Args:
+        rows: one a motion: name, state of each criterion, errors in m and rad.
+        totals: counts of each criterion and mean errors.
+    """
+    names = [key for key, value in totals.items() if isinstance(value, Mapping)]
+    cells = [["motion", *names, "mm", "deg"]]
+    for row in rows:
+        errors = [_error(row["errors"], q) for q in ("object_pos", "object_rot")]
+        states = [STATES.get(row[name], str(row[name])) for name in names]
+        cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors])
+    counts = [_rate(totals[name]) for name in names]
+    cells.append([f"all {len(rows)}", *counts, "", ""])
+    lines = [
+        f"policy of {totals.get('env_steps', 0):,} env steps",
+        "",
+        *align(cells),
+        "",
+    ]
+    return "\n".join([*lines, *_means(totals), "n.m.: not measured on this motion"])
+
+
+def _rate(states: Mapping[str, int]) -> str:
+    return f"{states['passed']}/{states['passed'] + states['failed']}"
+
+
+def _means(totals: Mapping[str, Any]) -> list[str]:
+    which = (("", "motions that pass sr_spider_centred"), ("_all", "all motions"))
+    return [
+        f"mean object error over {text} ({totals.get(f'mope{end}_motions', 0)}): "
+        f"{plain(totals.get(f'mope{end}'))} mm, "
+        f"{plain(in_unit('object_rot', totals.get(f'more{end}')))} deg"
+        for end, text in which
+    ]
+
+
+def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
+    """Every criterion of one stored rollout, with the numbers that were compared.
+
+    Args:
+        name: heading, usually the file.
+        verdicts: result of ``metrics.criteria.score``.
+    """
+    cells = [["criterion", "state", "values against limits"]]
+    for verdict in verdicts.values():
+        parts = [
+            f"{SHOWN[q][0]} {plain(in_unit(q, value))}/"
+            f"{in_unit(q, verdict.limits[q]):g} {SHOWN[q][1]}"
+            for q, value in verdict.values.items()
+        ]
+        state = verdict.state.replace("_", " ")
+        shown = ", ".join(parts) or verdict.reason
+        cells.append([verdict.name, state, shown])
+    return "\n".join([name, *align(cells, left=(0, 1, 2))])
+
+
+def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> str:
+    """One replayed rollout.
+
+    Args:
+        motion: its name.
+        stored: verdict in the run's files.
+        found: verdict of the replay.
+        holds: the conversion is proven and the files say so.
+    """
+    word = "holds" if holds else "DOES NOT HOLD"
+    name = shorten(motion, 40)
+    return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
+
+
+def align(cells: Sequence[Sequence[str]], *, left: Sequence[int] = (0,)) -> list[str]:
+    """Lay rows out in columns.
+
+    Args:
+        cells: rows of equal length.
+        left: columns aligned to the left; the others are numbers.
+    """
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        " ".join(
+            f"{cell:<{width}}" if index in left else f"{cell:>{width}}"
+            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+
+
+def plain(value: float | None, digits: int = 1) -> str:
+    """A number without separators, or ``-``.
+
+    Args:
+        value: number or None.
+        digits: behind the point.
+    """
+    missing = value is None or not math.isfinite(value)
+    return "-" if missing else number(value, digits).replace(",", "")
+
+
+def short(value: float) -> str:
+    """Three digits and a letter: ``12.3M``.
+
+    Args:
+        value: a count.
+    """
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:.0f}"
+
+
+def shorten(text: str, width: int) -> str:
+    """Cut a long text, marked by dots.
+
+    Args:
+        text: any.
+        width: characters it may have.
+    """
+    return text if len(text) <= width else f"{text[: width - 2]}.."

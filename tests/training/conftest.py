@@ -1,0 +1,65 @@
+"""Workbenches and learners of tiny sizes on the synthetic library."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from flashdex.recipe import AlgoConfig, EnvConfig, PhysicsConfig, Recipe, TrainConfig
+
+TINY = {
+    "batch_size": 32,
+    "buffer_size": 400,
+    "min_buffer": 40,
+    "n_step": 3,
+    "actor_width": 16,
+    "critic_width": 16,
+    "num_atoms": 11,
+    "future_latent": 8,
+    "future_channels": [8, 8, 8],
+}
+
+
+@pytest.fixture
+def make_bench(library, hands, bank):
+    """Build a workbench: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
+    from flashdex.training.setup import Workbench
+
+    def make(num_envs=6, *, algo=None, train=None, **env):
+        small = {"object_points": {"num_points": 8}}
+        transforms = {**EnvConfig().transforms, **small}
+        recipe = dataclasses.replace(
+            Recipe(name="tiny", total_env_steps=6000),
+            env=EnvConfig(num_envs=num_envs, **{"transforms": transforms, **env}),
+            algo=AlgoConfig(**{**TINY, **(algo or {})}),
+            physics=PhysicsConfig(num_threads=1),
+            train=TrainConfig(**(train or {})),
+        )
+        return Workbench(recipe, library, hands, bank)
+
+    return make
+
+
+@pytest.fixture
+def collect():
+    """Act, step and remember for a number of vector steps; return the last root."""
+    from flashdex import keys
+
+    def run(env, learner, steps, td=None):
+        td = env.reset() if td is None else td
+        for _ in range(steps):
+            action = learner.act(td)
+            for i, side in enumerate(keys.SIDES):
+                td.set(keys.action(side), action[:, i])
+            td, root = env.step_and_maybe_reset(td)
+            after = td["next"]
+            reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
+            learner.remember(
+                td, action, reward, after, after[keys.TERMINATED], after[keys.DONE]
+            )
+            td = root
+        return td
+
+    return run

@@ -1,0 +1,178 @@
+"""The ledger: one line an attempt, conversions that survive a crash."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from flashdex.metrics.certificate import certify
+from flashdex.metrics.rollout import Rollout
+from flashdex.training.ledger import CONVERSIONS, Ledger, read_lines, write_atomic
+from flashdex.training.rollouts import roll_all
+
+REQUIRED = {
+    "motion": str,
+    "converted": bool,
+    "criterion": str,
+    "errors": dict,
+    "env_steps": int,
+    "wall_s": float,
+    "seed": int,
+    "engine": str,
+    "completed": bool,
+    "why": list,
+    "frame": int,
+}
+
+
+@pytest.fixture(scope="module")
+def attempts(library, hands, bank):
+    """Zero residual actions: three attempts of full length."""
+    from flashdex.recipe import EnvConfig, PhysicsConfig, Recipe
+    from flashdex.training.setup import Workbench
+
+    recipe = Recipe(
+        name="tiny",
+        total_env_steps=1,
+        env=EnvConfig(num_envs=3, finger_mode="residual"),
+        physics=PhysicsConfig(num_threads=1),
+    )
+    bench = Workbench(recipe, library, hands, bank)
+
+    def idle(td, env):
+        return torch.zeros(env.num_envs, 2, 18)
+
+    return roll_all(bench, idle, criterion="sr_mt_obj")
+
+
+@pytest.fixture
+def passing(attempts):
+    """An attempt whose objects are written onto the reference, so that it passes."""
+    attempt = copy.deepcopy(attempts[0])
+    rollout = attempt.rollout
+    rollout.object_pos = rollout.ref_object_pos.copy()
+    rollout.object_quat = rollout.ref_object_quat.copy()
+    return attempt
+
+
+@pytest.fixture
+def failing(attempts):
+    """An attempt whose object is half a metre off from frame 20 on."""
+    attempt = copy.deepcopy(attempts[1])
+    attempt.rollout.object_pos = attempt.rollout.ref_object_pos.copy()
+    attempt.rollout.object_pos[20:, :, 0] += 0.5
+    return attempt
+
+
+def open_ledger(folder, library, **changes):
+    settings = {"criterion": "sr_mt_obj", "seed": 3, "engine": "cpu", "certify": False}
+    return Ledger(folder, library.names, **{**settings, **changes})
+
+
+def test_one_json_line_an_attempt(tmp_path, library, attempts, failing):
+    ledger = open_ledger(tmp_path, library)
+    for i, attempt in enumerate([*attempts, failing]):
+        ledger.record(attempt, env_steps=100 * i, wall_s=1.5 * i)
+    lines = [json.loads(x) for x in (tmp_path / CONVERSIONS).read_text().splitlines()]
+    assert len(lines) == 4
+    for line in lines:
+        for key, kind in REQUIRED.items():
+            assert isinstance(line[key], kind), key
+        assert line["certified"] is None
+        assert set(line["errors"]) == {"object_pos", "object_rot"}
+        assert (line["criterion"], line["seed"]) == ("sr_mt_obj", 3)
+    assert [x["env_steps"] for x in lines] == [0, 100, 200, 300]
+    assert ledger.attempts == {"right_box": 1, "left_ball": 2, "both": 1}
+
+
+def test_a_failed_attempt_says_why(tmp_path, library, failing):
+    ledger = open_ledger(tmp_path, library)
+    assert ledger.record(failing, env_steps=5, wall_s=0.1) is None
+    line = read_lines(tmp_path / CONVERSIONS)[0]
+    assert not line["converted"]
+    cause = line["why"][0]
+    assert (cause["cause"], cause["hand"], cause["frame"]) == ("object_pos", "left", 20)
+    errors = failing.rollout.object_pos[15:, 0] - failing.rollout.ref_object_pos[15:, 0]
+    mean = np.linalg.norm(errors, axis=-1).mean()
+    assert line["errors"]["object_pos"] == pytest.approx(mean, abs=1e-5)
+    assert not list((tmp_path / "rollouts").iterdir())
+
+
+def test_an_attempt_that_was_ended_names_the_termination(tmp_path, library, failing):
+    failing.why = [{"cause": "object_dropped", "hand": "left"}]
+    failing.completed = False
+    ledger = open_ledger(tmp_path, library)
+    ledger.record(failing, env_steps=5, wall_s=0.1)
+    line = read_lines(tmp_path / CONVERSIONS)[0]
+    assert line["why"] == [{"cause": "object_dropped", "hand": "left"}]
+    assert line["completed"] is False
+
+
+def test_only_the_first_pass_is_a_conversion(tmp_path, library, passing):
+    ledger = open_ledger(tmp_path, library)
+    first = ledger.record(passing, env_steps=10, wall_s=2.0)
+    assert (first.motion, first.env_steps, first.certified) == ("right_box", 10, None)
+    assert ledger.record(passing, env_steps=20, wall_s=3.0) is None
+    assert ledger.num_converted == 1
+    lines = read_lines(tmp_path / CONVERSIONS)
+    assert [x["converted"] for x in lines] == [True, True]
+    stored = Rollout.load(tmp_path / lines[0]["rollout"])
+    assert (stored.qpos == passing.rollout.qpos).all()
+    assert json.loads(stored.errors) == lines[0]["errors"]
+    metrics = ledger.metrics(2.0)
+    assert metrics["convert/cumulative"] == 1
+    assert metrics["convert/rate"] == pytest.approx(1 / 3)
+    assert metrics["convert/attempts"] == 2
+    assert metrics["convert/per_gpu_hour"] == 0.5
+
+
+def test_the_stored_verdict_is_that_of_a_fresh_certificate(tmp_path, library, passing):
+    ledger = open_ledger(tmp_path, library, certify=True)
+    conversion = ledger.record(passing, env_steps=10, wall_s=2.0)
+    line = read_lines(tmp_path / CONVERSIONS)[0]
+    fresh = certify(Rollout.load(tmp_path / line["rollout"]))
+    assert line["verdict"] == fresh.verdict
+    assert line["certified"] == conversion.certified
+    assert line["certified"] == (fresh.verdict in ("certified", "robust"))
+    stored = json.loads((tmp_path / "rollouts/right_box.certificate.json").read_text())
+    assert stored == json.loads(fresh.to_json())
+    assert ledger.num_certified == int(line["certified"])
+
+
+@pytest.mark.parametrize("cut", [1, 40])
+def test_a_cut_off_last_line_costs_that_line_only(
+    tmp_path, library, passing, failing, cut
+):
+    ledger = open_ledger(tmp_path, library)
+    ledger.record(passing, env_steps=10, wall_s=2.0)
+    ledger.record(failing, env_steps=20, wall_s=2.5)
+    path = tmp_path / CONVERSIONS
+    path.write_text(path.read_text()[:-cut])
+    again = open_ledger(tmp_path, library)
+    assert list(again.conversions) == ["right_box"]
+    assert again.conversions["right_box"].env_steps == 10
+    assert again.attempts["right_box"] == 1
+    # what is written next must be readable, too
+    again.record(failing, env_steps=30, wall_s=3.0)
+    lines = read_lines(path)
+    assert lines[-1]["env_steps"] == 30
+    assert open_ledger(tmp_path, library).attempts["left_ball"] == 1
+    assert list(open_ledger(tmp_path, library).conversions) == ["right_box"]
+
+
+def test_a_broken_line_in_the_middle_is_an_error(tmp_path):
+    path = tmp_path / "x.jsonl"
+    path.write_text('{"a": 1}\n{"b":\n{"c": 2}\n')
+    with pytest.raises(ValueError, match="Expecting"):
+        read_lines(path)
+
+
+def test_atomic_writes_leave_no_temporary_file(tmp_path):
+    for text in ("one", "two"):
+        write_atomic(tmp_path / "a.json", text)
+        assert (tmp_path / "a.json").read_text() == text
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]

@@ -1,0 +1,131 @@
+"""Stored rollouts replay bit for bit in plain MuJoCo C, contacts included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from flashdex import keys
+from flashdex.metrics.certificate import certify
+from flashdex.metrics.criteria import score
+from flashdex.metrics.resimulation import load_scene, resimulate
+from flashdex.metrics.rollout import Rollout
+from flashdex.training.attempts import AttemptRecorder
+from flashdex.training.rollouts import roll_all
+
+
+def shaky(scale, seed=0):
+    """A controller of random actions."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def act(td, env):
+        return scale * (2 * torch.rand(env.num_envs, 2, 18, generator=generator) - 1)
+
+    return act
+
+
+@pytest.fixture(scope="module")
+def attempts(library, hands, bank):
+    from flashdex.recipe import EnvConfig, PhysicsConfig, Recipe
+    from flashdex.training.setup import Workbench
+
+    recipe = Recipe(
+        name="tiny",
+        total_env_steps=1,
+        env=EnvConfig(num_envs=3, finger_mode="residual"),
+        physics=PhysicsConfig(num_threads=1),
+    )
+    bench = Workbench(recipe, library, hands, bank)
+    return roll_all(bench, shaky(0.7), criterion="sr_mt_obj")
+
+
+def test_one_full_length_attempt_a_motion(attempts, library):
+    assert [a.rollout.motion for a in attempts] == library.names
+    for attempt, length in zip(
+        attempts, library.motions["length"].tolist(), strict=True
+    ):
+        assert attempt.completed
+        assert attempt.rollout.num_frames == length - 1
+        assert attempt.rollout.reference_length == length - 1
+
+
+@pytest.mark.parametrize("motion", [0, 1, 2])
+def test_replay_is_bit_equal(attempts, tmp_path, motion):
+    path = attempts[motion].rollout.save(tmp_path / "rollout.npz")
+    rollout = Rollout.load(path)
+    touched = 0
+
+    def watch(model, data):
+        nonlocal touched
+        touched += sum(
+            1 for c in data.contact if {model.geom_bodyid[g] for g in c.geom} - {0}
+        )
+
+    run = resimulate(load_scene(rollout), rollout, monitor=watch)
+    assert touched > 200
+    assert (run.qpos == rollout.qpos).all()
+    deviation = certify(rollout, num_perturbations=0).deviation
+    assert deviation["max_mm"] == 0
+    assert deviation["max_deg"] == 0
+    assert deviation["first_frame_beyond"] == -1
+    assert deviation["stored_mismatch_mm"] == 0
+
+
+def test_what_is_scored_is_what_the_engine_measures(attempts):
+    for attempt in attempts:
+        rollout = attempt.rollout
+        run = resimulate(load_scene(rollout), rollout)
+        ours = score(rollout.signals(), grace=rollout.grace)
+        theirs = score(run.signals, grace=rollout.grace)
+        for name, verdict in ours.items():
+            assert verdict.state == theirs[name].state
+            for key, value in verdict.values.items():
+                assert value == pytest.approx(theirs[name].values[key], abs=1e-5)
+
+
+def test_rows_are_scored_on_the_right_frames(attempts, library):
+    rollout = attempts[2].rollout
+    start, length = (int(library.motions[k][2]) for k in ("start", "length"))
+    rows = slice(start + 1, start + length)
+    ref = library.frames["object_pos"][rows].numpy()
+    np.testing.assert_allclose(rollout.ref_object_pos, ref, atol=1e-7)
+    tips = library.frames["keypoints"][rows][:, :, list(keys.TIP_KEYPOINTS)].numpy()
+    np.testing.assert_allclose(rollout.ref_fingertips, tips, atol=1e-7)
+
+
+def test_training_attempts_replay_bit_equal_after_resets(make_env):
+    # worlds that were reset many times, beside assisted and terminated neighbours
+    from flashdex.recipe import AssistConfig
+
+    env = make_env(
+        6,
+        attempt_share=0.5,
+        physics={"num_threads": 2},
+        finger_mode="residual",
+        assist=AssistConfig(enabled=True),
+    )
+    recorder = AttemptRecorder(env, criterion="sr_mt_obj", seed=0)
+    env.forced_motion = torch.tensor([2, 1, 0, 2, 1, 0])
+    td, act, found = env.reset(), shaky(0.3), []
+    recorder.begin(torch.arange(6))
+    for step in range(110):
+        if step % 20 == 0:
+            env.forced_motion = (env.forced_motion + 1) % 3
+        action = act(td, env)
+        for i, side in enumerate(keys.SIDES):
+            td.set(keys.action(side), action[:, i])
+        td = env.step(td)
+        found += recorder.step(action, td["next"], step)
+        done = td["next", keys.DONE]
+        td = env.maybe_reset(td["next"].clone())
+        recorder.begin(done.squeeze(-1).nonzero().squeeze(-1))
+    assert len(found) > 5
+    motions = {a.rollout.motion for a in found}
+    assert "both" in motions
+    for attempt in found[-6:]:
+        rollout = attempt.rollout
+        run = resimulate(load_scene(rollout), rollout)
+        assert (run.qpos == rollout.qpos).all()
+        assert attempt.completed == (not attempt.why)
+        assert attempt.frame == rollout.num_frames

@@ -1,0 +1,233 @@
+"""A run directory: a rollout stepped by MuJoCo C, and lines as training writes them."""
+
+import json
+import math
+import re
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from flashdex.cli import main
+from flashdex.metrics.certificate import certify
+from flashdex.metrics.rollout import Rollout
+
+FRAMES, DECIMATION = 36, 4
+EVIL = '<script>alert("x")</script> & co'
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+SITES = "".join(f'<site name="left_pad_{f}" pos=".02 0 0"/>' for f in FINGERS)
+SCENE = f"""
+<mujoco>
+  <option timestep="0.004166666666666667"/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1" rgba=".9 .9 .9 1"/>
+    <body name="left_base" pos="-.08 0 .03">
+      <joint name="left_slide" type="slide" axis="1 0 0" damping="1"/>
+      <geom type="box" size=".02 .04 .02" mass=".2"/>{SITES}
+    </body>
+    <body name="box" pos="0 0 .03">
+      <freejoint name="box"/>
+      <geom type="box" size=".03 .05 .03" mass=".3" rgba=".9 .2 .1 1"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="left_slide" kp="400" kv="20"/></actuator>
+</mujoco>"""
+
+
+def make_rollout(**changes):
+    """A finger pushes a box; the reference is what happened, 5 mm beside it."""
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    ctrl = np.linspace(0, 0.15, FRAMES)[:, None]
+    qpos, qvel, tips, links = [], [], [], []
+    for row in ctrl:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, nstep=DECIMATION)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        after = mujoco.MjData(model)
+        after.qpos[:] = data.qpos
+        mujoco.mj_forward(model, after)
+        tips.append(after.site_xpos.copy())
+        links.append(after.xpos[[model.body("left_base").id] * 2])
+    qpos, qvel, tips, links = map(np.array, (qpos, qvel, tips, links))
+    tips = np.stack([tips, np.zeros_like(tips)], 1)
+    links = np.stack([links, np.zeros_like(links)], 1)
+    pos, quat = qpos[:, None, 1:4], qpos[:, None, 4:8]
+    values = {
+        "motion": "push",
+        "hand": "finger",
+        "fps": 60.0,
+        "decimation": DECIMATION,
+        "grace": 15,
+        "qpos0": model.qpos0.copy(),
+        "qvel0": np.zeros(model.nv),
+        "ctrl": ctrl,
+        "qpos": qpos,
+        "qvel": qvel,
+        "object_pos": pos,
+        "object_quat": quat,
+        "ref_object_pos": pos + np.array([0, 0.005, 0]),
+        "ref_object_quat": quat.copy(),
+        "fingertips": tips,
+        "ref_fingertips": tips.copy(),
+        "joints": links,
+        "ref_joints": links.copy(),
+        "hand_active": np.array([True, False]),
+        "hand_object": np.array([0, -1]),
+        "object_qpos_adr": np.array([1]),
+        "object_qvel_adr": np.array([1]),
+        "joint_bodies": json.dumps([["left_base", "left_base"], []]),
+        "model_xml": SCENE,
+        "criterion": "sr_mt_obj",
+        "errors": "{}",
+        "versions": "{}",
+        "seed": 3,
+        "env_steps": 1000,
+        "actions": np.zeros((FRAMES, 2, 1), dtype=np.float32),
+    }
+    return Rollout(**{**values, **changes})
+
+
+@pytest.fixture(scope="session")
+def rollout():
+    return make_rollout()
+
+
+@pytest.fixture(scope="session")
+def certificate(rollout):
+    return certify(rollout)
+
+
+def attempt(motion, env_steps, *, wall_s=60.0, converted=False, errors=None, why=()):
+    return {
+        "motion": motion,
+        "converted": converted,
+        "certified": None,
+        "criterion": "sr_mt_obj",
+        "errors": errors or {},
+        "passed": [],
+        "completed": bool(errors),
+        "why": [{"cause": cause, "hand": hand} for cause, hand in why],
+        "frame": 17,
+        "env_steps": env_steps,
+        "wall_s": wall_s,
+        "seed": 3,
+        "engine": "cpu",
+        "trivial": [],
+    }
+
+
+def write_lines(path, lines):
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+@pytest.fixture
+def empty_run(tmp_path):
+    """A run that has just begun: a recipe and versions, nothing else."""
+    run = tmp_path / "run"
+    run.mkdir()
+    recipe = {
+        "name": "tiny",
+        "seed": 3,
+        "hand": "finger",
+        "total_env_steps": 50_000,
+        "ablation": "none",
+        "physics": {"engine": "cpu"},
+        "train": {"criterion": "sr_mt_obj", "render_conversions": False},
+    }
+    (run / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    versions = {"flashdex": "0.1.0", "mujoco": "4.0", "hardware": "8 cores, no GPU"}
+    (run / "versions.json").write_text(json.dumps(versions))
+    return run
+
+
+@pytest.fixture
+def run_dir(empty_run, rollout, certificate):
+    """Three motions: one converted and proven, one never completed, one off."""
+    run = empty_run
+    rollout.save(run / "rollouts" / "push.npz")
+    certificate.save(run / "rollouts" / "push.certificate.json")
+    converted = attempt(
+        "push", 12_345, wall_s=90.0, converted=True, errors={"object_pos": 0.005}
+    )
+    converted["errors"]["object_rot"] = math.radians(2.0)
+    converted |= {
+        "passed": ["sr_mt_obj", "sr_mt_obj_left"],
+        "rollout": "rollouts/push.npz",
+        "certified": True,
+        "verdict": "robust",
+    }
+    dropped = [("object_dropped", "right")]
+    lines = [
+        attempt("push", 2_000, why=[("fingertip_off", "left")]),
+        attempt(EVIL, 3_000, why=dropped),
+        attempt(EVIL, 4_000, why=dropped),
+        attempt(EVIL, 5_000, why=[("early_reset", "right")]),
+        attempt("turn", 6_000, errors={"object_pos": 0.09, "object_rot": 0.1}),
+        converted,
+        attempt("turn", 14_000, errors={"object_pos": 0.0412, "object_rot": 0.2}),
+    ]
+    for line in lines:
+        if line["motion"] == "turn":
+            line["why"] = [{"cause": "object_pos", "hand": "left"}]
+    write_lines(run / "conversions.jsonl", lines)
+    metrics = [
+        {
+            "env_steps": float(step),
+            "hours": step / 400_000,
+            "convert/cumulative": float(step > 12_345),
+            "convert/rate": float(step > 12_345) / 5,
+            "reward/left/wrist_pos": step / 20_000,
+            "reward/right/wrist_pos": 0.5,
+            "loss/left/loss_actor": -0.1,
+            "episode/completed": 0.4,
+            "perf/env_steps_per_s": 100.0,
+        }
+        for step in (1_000, 8_000, 16_000)
+    ]
+    write_lines(run / "metrics.jsonl", metrics)
+    scored = {
+        "passed": ["sr_mt_obj"],
+        "state": "passed",
+        "errors": {"object_pos": 0.0071, "object_rot": math.radians(4)},
+    }
+    failed = {
+        "passed": [],
+        "state": "failed",
+        "errors": {"object_pos": 0.0632, "object_rot": math.radians(11)},
+    }
+    baselines = {
+        "do_nothing": {"push": failed, EVIL: failed, "turn": failed},
+        "kinematic_playback": {"push": scored, EVIL: failed, "turn": failed},
+    }
+    (run / "baselines.json").write_text(json.dumps(baselines))
+    return run
+
+
+@pytest.fixture
+def call(capsys):
+    """Run the command; return exit code, stdout, stderr."""
+
+    def run(*argv):
+        code = main([str(word) for word in argv])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def table_rows():
+    """Cells of the report's table, by row and heading, without markup."""
+
+    def parse(text):
+        body = re.search(r"<tbody>(.*?)</tbody>", text, re.DOTALL).group(1)
+        rows = []
+        for row in re.findall(r"<tr>(.*?)</tr>", body, re.DOTALL):
+            cells = re.findall(r'<td data-label="(.*?)">(.*?)</td>', row, re.DOTALL)
+            rows.append({h: re.sub(r"<[^>]*>", "", c).strip() for h, c in cells})
+        return rows
+
+    return parse

@@ -1,0 +1,137 @@
+"""Films: the camera against MuJoCo's own, and pictures where a back end draws."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from flashdex.viz import film
+from flashdex.viz.camera import MARGIN, fit_view, view_axes
+from flashdex.viz.film import NO_GRAPHICS, Film, draw_films, find_backend
+from flashdex.viz.report import write_report
+
+DRAW = """
+import sys, numpy as np
+from flashdex.metrics.rollout import Rollout
+from flashdex.viz.frames import Painter
+painter = Painter(Rollout.load(sys.argv[1]))
+np.save(sys.argv[2], painter.draw(20))
+"""
+
+
+@pytest.fixture
+def backend():
+    found = find_backend()
+    if found is None:
+        pytest.skip("no off-screen graphics: install libosmesa6 or libegl1")
+    return found
+
+
+def draw(rollout, folder, backend):
+    """One picture, made in a process of its own."""
+    stored, target = rollout.save(folder / "one.npz"), folder / "one.npy"
+    assert film._run(["-c", DRAW, str(stored), str(target)], backend, timeout=120) == ""
+    return np.load(target).astype(int)
+
+
+def blue(picture):
+    """Number of pixels of the ghost's colour, which nothing else in the scene has."""
+    red, _, strong = (picture[..., i] for i in range(3))
+    return int((strong > red + 60).sum())
+
+
+def test_axes_are_an_orthonormal_right_handed_frame():
+    forward, right, up = axes = view_axes(135.0, -22.0)
+    assert np.stack(axes) @ np.stack(axes).T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.cross(right, forward) == pytest.approx(up)
+    assert up[2] > 0
+    assert forward[2] < 0
+    # azimuth 90 looks along y, as MuJoCo's free camera does
+    assert view_axes(90.0, 0.0)[0] == pytest.approx([0, 1, 0], abs=1e-12)
+
+
+def test_axes_agree_with_mujoco(backend):
+    code = (
+        "import mujoco, json; m = mujoco.MjModel.from_xml_string('<mujoco><worldbody>"
+        '<geom size=".1"/></worldbody></mujoco>\'); d = mujoco.MjData(m); '
+        "mujoco.mj_forward(m, d); c = mujoco.MjvCamera(); "
+        "c.azimuth, c.elevation = 35, -22; "
+        "r = mujoco.Renderer(m, 16, 16); r.update_scene(d, c); g = r.scene.camera[0]; "
+        "print(json.dumps([g.forward.tolist(), g.up.tolist()]))"
+    )
+    env = {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PATH": ""}
+    out = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, check=True
+    )
+    forward, _, up = view_axes(35.0, -22.0)
+    theirs = json.loads(out.stdout.splitlines()[-1])
+    assert np.array(theirs) == pytest.approx(np.stack([forward, up]), abs=1e-5)
+
+
+def test_every_point_is_inside_centred_and_one_touches_the_border():
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
+    points += np.array([3, -2, 1])
+    forward, right, up = axes = view_axes(45.0, -22.0)
+    lookat, distance = fit_view(points, axes, fovy=45.0, aspect=4 / 3)
+    rel = points - lookat
+    x, y, depth = rel @ right, rel @ up, distance + rel @ forward
+    half = np.tan(np.radians(22.5)) * depth
+    room = np.minimum(half * 4 / 3 - abs(x), half - abs(y))
+    assert room.min() == pytest.approx(MARGIN)
+    for seen in (x / depth, y / depth):
+        assert seen.max() == pytest.approx(-seen.min(), abs=0.01)
+
+
+def test_the_picture_shows_object_and_ghost(rollout, tmp_path, backend):
+    shifted = rollout.ref_object_pos + np.array([0, 0, 0.1])
+    apart = draw(replace(rollout, ref_object_pos=shifted), tmp_path, backend)
+    same = draw(replace(rollout, ref_object_pos=rollout.object_pos), tmp_path, backend)
+    assert apart.shape == (384, 512, 3)
+    assert apart.std() > 10
+    red = (apart[..., 0] > apart[..., 2] + 60).sum()
+    assert red > 500  # the box itself
+    assert blue(apart) > 500  # the ghost above it
+    assert blue(same) < 50  # no ghost where there is no error
+
+
+def test_films_of_a_run(run_dir, backend):
+    recipe = yaml.safe_load((run_dir / "recipe.yaml").read_text())
+    recipe["train"]["render_conversions"] = True
+    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    text = write_report(run_dir).read_text()
+    assert "data:video/mp4;base64," in text
+    assert "data:image/png;base64," in text
+    drawn = Film.of(run_dir / "rollouts" / "push.npz")
+    assert np.asarray(Image.open(drawn.stills).convert("RGB")).std() > 10
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(drawn.video))
+    assert frames == 18  # 36 rows at 60 Hz, shown at 30
+    assert seconds == pytest.approx(0.6, abs=0.05)
+    before = drawn.video.stat().st_mtime_ns
+    write_report(run_dir)
+    assert drawn.video.stat().st_mtime_ns == before  # drawn once
+
+
+def test_without_graphics_the_report_says_so_and_goes_on(run_dir, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "no_such_back_end")
+    find_backend.cache_clear()
+    recipe = yaml.safe_load((run_dir / "recipe.yaml").read_text())
+    recipe["train"]["render_conversions"] = True
+    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    text = write_report(run_dir).read_text()
+    find_backend.cache_clear()
+    assert NO_GRAPHICS in text
+    assert "12,345" in text
+
+
+def test_a_rollout_that_cannot_be_drawn_is_named(run_dir, backend):
+    broken = run_dir / "rollouts" / "broken.npz"
+    broken.write_bytes(b"nothing")
+    fault = draw_films([broken])
+    assert fault.startswith("no pictures of broken: ")
+    assert "not a readable rollout" in fault

@@ -20,6 +20,8 @@ from flashdex.geometry.rotation import (
 if TYPE_CHECKING:
     from flashdex.recipe import AssistConfig
 
+GRAVITY = 9.81  # m/s2
+
 
 def assist_wrench(
     pose: Tensor,
@@ -66,6 +68,49 @@ def assist_wrench(
     torque = quat_rotate(quat, (inertia @ local.unsqueeze(-1)).squeeze(-1))
     force = force.clamp(-force_limit, force_limit)
     return torch.cat([force, torque.clamp(-torque_limit, torque_limit)], -1)
+
+
+def hold_wrench(
+    pose: Tensor,
+    vel: Tensor,
+    ref_pose: Tensor,
+    ref_vel: Tensor,
+    mass: Tensor,
+    inertia: Tensor,
+    share: Tensor,
+    *,
+    stiffness: float,
+) -> Tensor:
+    """Carry each object along its reference while a grip forms after a reset.
+
+    A reference pose in mid grasp has no grip force yet: without help the object falls
+    some centimetres before the fingers have closed. Critically damped, mass-normalised,
+    gravity included: ``F = share m (w^2 (x_ref - x) + 2 w (v_ref - v) + g)``, torques
+    alike with the inertia.
+
+    Args:
+        pose: object position and quaternion, world, (N, O, 7).
+        vel: linear and angular velocity, world, (N, O, 6).
+        ref_pose: reference, (N, O, 7).
+        ref_vel: reference, (N, O, 6).
+        mass: kg, (N, O).
+        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
+        share: 1 right after the reset, falling to 0, (N,).
+        stiffness: w, rad/s.
+
+    Returns:
+        Force and torque in world axes, (N, O, 6).
+    """
+    quat = pose[..., 3:]
+    turn = quat_to_rotvec(quat_mul(ref_pose[..., 3:], quat_conj(quat)))
+    offset = torch.cat([ref_pose[..., :3] - pose[..., :3], turn], -1)
+    accel = stiffness**2 * offset + 2 * stiffness * (ref_vel - vel)
+    force = accel[..., :3]
+    force[..., 2] += GRAVITY
+    local = quat_rotate_inverse(quat, accel[..., 3:]).unsqueeze(-1)
+    torque = quat_rotate(quat, (inertia @ local).squeeze(-1))
+    wrench = torch.cat([mass.unsqueeze(-1) * force, torque], -1)
+    return share[:, None, None] * wrench
 
 
 class AssistSchedule:

@@ -12,7 +12,10 @@ from __future__ import annotations
 import math
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
+
+from flashdex.geometry.rotation import quat_rotate_inverse
 
 CODE_WIDTH = 7
 MAX_FORCE = 500.0  # N; larger forces saturate
@@ -36,6 +39,19 @@ def encode_contact(force: Tensor, point: Tensor) -> Tensor:
     code = torch.cat([direction, magnitude, point / POINT_RANGE], -1)
     code = torch.round(code.clamp(-1, 1) * 127)
     return torch.where(size > 1e-6, code, torch.zeros_like(code)).to(torch.int8)
+
+
+def contact_code(wrench: Tensor, kin: TensorDictBase) -> Tensor:
+    """Code the engine's net force and point of each link, (N, 2, L, 7) int8.
+
+    Args:
+        wrench: force on the link and force-weighted point, world, N and m,
+            (N, 2, L, 6).
+        kin: forward kinematics of the same state, batch (N, 2).
+    """
+    force = quat_rotate_inverse(kin["link_quat"], wrench[..., :3])
+    lever = wrench[..., 3:] - kin["link_pos"]
+    return encode_contact(force, quat_rotate_inverse(kin["link_quat"], lever))
 
 
 def decode_contact(code: Tensor) -> tuple[Tensor, Tensor, Tensor]:

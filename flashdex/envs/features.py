@@ -185,6 +185,24 @@ def fingertip_distance(
     return distance, to_wrist(kin["wrist_quat"], quat_rotate(quat, normal))
 
 
+def tip_distance(
+    kin: TensorDictBase,
+    own_pos: Tensor,
+    own_quat: Tensor,
+    rows: Tensor,
+    sdf: SdfGrid,
+    tip_radius: Tensor,
+) -> Tensor:
+    """Eq. (7) for the fingertips alone, without normals; (N, 2, 5).
+
+    Arguments are those of ``fingertip_distance``.
+    """
+    local = kin["tip_center"] - own_pos.unsqueeze(-2)
+    local = quat_rotate_inverse(own_quat.unsqueeze(-2), local)
+    distance, _ = sdf.query(local, rows.unsqueeze(-1).expand(local.shape[:-1]))
+    return distance - tip_radius
+
+
 def contact(kin: TensorDictBase, code: Tensor) -> Tensor:
     """Contact wrench and point of each link in the wrist frame, (N, 2, 11 L).
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs import rewards, terminations
-from flashdex.envs.features import fingertip_distance, gather_own
+from flashdex.envs.features import gather_own, tip_distance
 from flashdex.envs.reference import ReferenceBank
 from flashdex.geometry.rotation import quat_angle
 from flashdex.hands.spec import HandSpec
@@ -75,6 +75,9 @@ class Judge:
         self.joint_span = ranges[..., 1] - ranges[..., 0]
         radii = [torch.as_tensor(hands[s].tip_radius) for s in keys.SIDES]
         self.tip_radius = torch.stack(radii).float()
+        if "object_points" in self.rewards:
+            rho = self.rewards["object_points"].rho
+            self.points = rewards.rescale_points(bank.points, bank.radius, rho=rho)
         self.object_sum = torch.zeros(num_envs, 2)
 
     def reset(self, env_ids: Tensor) -> None:
@@ -147,11 +150,8 @@ class Judge:
         for name, o in self.rewards.items():
             match name:
                 case "object_points":
-                    points = rewards.rescale_points(
-                        self.bank.points[rows], self.bank.radius[rows], rho=o.rho
-                    )
                     error = rewards.object_points_error(
-                        points, pos, quat, ref_pos, ref_quat, top_k=o.top_k
+                        self.points[rows], pos, quat, ref_pos, ref_quat, top_k=o.top_k
                     )
                     out[name] = rewards.exp_kernel(error, sigma=o.sigma)
                 case "object_pose":
@@ -164,11 +164,11 @@ class Judge:
                         beta_rot=o.beta_rot,
                     )
                 case "fingertip_distance":
-                    distance, _ = fingertip_distance(
+                    distance = tip_distance(
                         kin, pos, quat, rows, self.bank.sdf, self.tip_radius
                     )
                     out[name] = rewards.fingertip_distance_exp(
-                        distance[..., 1:], ref["tip_dist"], sigma=o.sigma
+                        distance, ref["tip_dist"], sigma=o.sigma
                     )
                 case "wrist_pos":
                     out[name] = rewards.wrist_pos_error_exp(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from flashdex.geometry.rotation import quat_angle, transform_points
+from flashdex.geometry.rotation import quat_angle, quat_to_matrix
 
 
 def object_points_error(
@@ -37,9 +37,10 @@ def object_points_error(
     Returns:
         Error in metres, (...).
     """
-    current = transform_points(pos, quat, points)
-    reference = transform_points(ref_pos, ref_quat, points)
-    error = (current - reference).norm(dim=-1)
+    # (R p + t) - (R_ref p + t_ref) = (R - R_ref) p + (t - t_ref): one product, not two
+    turn = quat_to_matrix(quat) - quat_to_matrix(ref_quat)
+    shift = (pos - ref_pos).unsqueeze(-2)
+    error = (points @ turn.mT + shift).norm(dim=-1)
     return error.topk(min(top_k, error.shape[-1]), dim=-1).values.mean(-1)
 
 

@@ -9,20 +9,20 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from flashdex import keys
 from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
-from flashdex.envs.assist import AssistSchedule, assist_wrench
-from flashdex.envs.contact import CODE_WIDTH, encode_contact
+from flashdex.envs.assist import AssistSchedule, assist_wrench, hold_wrench
+from flashdex.envs.contact import CODE_WIDTH, contact_code
 from flashdex.envs.features import gather_own
 from flashdex.envs.judge import Judge, Outcome
 from flashdex.envs.physics.base import Physics, WrenchFn
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.reset import ResetDraw, draw_reset, reset_state
 from flashdex.envs.samplers import SAMPLERS, UnconvertedSampler
-from flashdex.geometry.rotation import quat_rotate_inverse
+from flashdex.envs.specs import action_spec, done_spec, reward_spec, state_spec
+from flashdex.envs.threads import few_threads
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.recipe import EnvConfig
@@ -104,6 +104,8 @@ class TrackingEnv(EnvBase):
         self.target_override: Callable[[TrackingEnv], Tensor] | None = None
         self._filter = torch.zeros(n, 2, 6)
         self._target = torch.zeros(n, 2, self.joint_range.shape[1])
+        shape = (n, 2, hands["left"].num_links, CODE_WIDTH)
+        self._contact = torch.zeros(shape, dtype=torch.int8)
         self.info: StepInfo | None = None
         self._make_specs()
         self.generator = torch.Generator()
@@ -112,38 +114,11 @@ class TrackingEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, joints = self.num_envs, self.joint_range.shape[1]
-        slots, links = self.bank.num_slots, self.hands["left"].num_links
-        whole = {"dtype": torch.int64}
-        self.observation_spec = Composite(
-            {
-                keys.JOINT_POS: Unbounded((n, 2, joints)),
-                keys.JOINT_VEL: Unbounded((n, 2, joints)),
-                keys.JOINT_TARGET: Unbounded((n, 2, joints)),
-                keys.OBJECT_POSE: Unbounded((n, slots, 7)),
-                keys.OBJECT_VEL: Unbounded((n, slots, 6)),
-                keys.CONTACT: Unbounded((n, 2, links, CODE_WIDTH), dtype=torch.int8),
-                keys.MOTION: Unbounded((n, 1), **whole),
-                keys.FRAME: Unbounded((n, 1), **whole),
-                keys.ATTEMPT: Binary(1, (n, 1), dtype=torch.bool),
-            },
-            shape=(n,),
-        )
-        one = Bounded(-1.0, 1.0, (n, joints))
-        self.action_spec = Composite(
-            {s: Composite({keys.ACTION: one.clone()}, shape=(n,)) for s in keys.SIDES},
-            shape=(n,),
-        )
-        reward = Unbounded((n, 1))
-        self.reward_spec = Composite(
-            {
-                s: Composite({keys.REWARD: reward.clone()}, shape=(n,))
-                for s in keys.SIDES
-            },
-            shape=(n,),
-        )
-        flag = Binary(1, (n, 1), dtype=torch.bool)
-        names = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-        self.full_done_spec = Composite({k: flag.clone() for k in names}, shape=(n,))
+        links = self.hands["left"].num_links
+        self.observation_spec = state_spec(n, joints, self.bank.num_slots, links)
+        self.action_spec = action_spec(n, joints)
+        self.reward_spec = reward_spec(n)
+        self.full_done_spec = done_spec(n)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(0 if seed is None else seed)
@@ -164,6 +139,13 @@ class TrackingEnv(EnvBase):
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.num_envs)
         ids = mask.nonzero().squeeze(-1)
+        with few_threads(self.num_envs):
+            out = self._reset_worlds(ids)
+        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+            out[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return out
+
+    def _reset_worlds(self, ids: Tensor) -> TensorDict:
         if len(ids):
             draw = self._draw(ids)
             state = reset_state(draw, self.bank, self.joint_range)
@@ -175,10 +157,10 @@ class TrackingEnv(EnvBase):
             self._filter[ids] = 0.0
             self._target[ids] = state["joint_pos"]
             self.judge.reset(ids)
-        out = self._observation(self.physics.state())
-        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
-        return out
+        state = self.physics.state()
+        kin = self.kinematics(state[keys.JOINT_POS][ids], None)
+        self._contact[ids] = contact_code(state[keys.CONTACT][ids], kin)
+        return self._observation(state)
 
     def _draw(self, ids: Tensor) -> ResetDraw:
         attempt = self.attempt[ids]
@@ -198,6 +180,10 @@ class TrackingEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with few_threads(self.num_envs):
+            return self._step_worlds(tensordict)
+
+    def _step_worlds(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = torch.stack([tensordict[keys.action(s)] for s in keys.SIDES], 1)
         action = torch.nan_to_num(action).clamp(-1.0, 1.0)
         ref = self.bank.at(self.motion, self.frame)
@@ -212,6 +198,7 @@ class TrackingEnv(EnvBase):
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
         self.frame = scored + 1
+        self._contact = contact_code(state[keys.CONTACT], kin)
         out = self._observation(state)
         for i, side in enumerate(keys.SIDES):
             out[keys.reward(side)] = outcome.reward[:, i : i + 1]
@@ -237,45 +224,62 @@ class TrackingEnv(EnvBase):
         self.physics.step(self._target, self._wrench(ref))
 
     def _wrench(self, ref: TensorDictBase) -> WrenchFn | None:
-        if self.assist is None or not self.assist.active:
+        """What acts on the objects besides contact and gravity; None is nothing."""
+        assist = self.assist if self.assist is not None and self.assist.active else None
+        hold = self._hold_share()
+        if assist is None and not hold.any():
             return None
-        c = self.assist.config
         ref_pose = torch.cat([ref["object_pos"], ref["object_quat"]], -1)
         ref_vel = torch.cat([ref["object_linvel"], ref["object_angvel"]], -1)
         rows = self.bank.object_index[self.motion]
+        mass = self.bank.mass[rows.clamp_min(0)]
         inertia = self.bank.inertia[rows.clamp_min(0)]
         present = (rows >= 0).unsqueeze(-1)
 
         def wrench(pose: Tensor, vel: Tensor) -> Tensor:
-            values = assist_wrench(
+            total = hold_wrench(
                 pose,
                 vel,
                 ref_pose,
                 ref_vel,
+                mass,
                 inertia,
-                self.assist_kp,
-                self.assist_kv,
-                torque_ratio=c.torque_ratio,
-                force_limit=c.force_limit,
-                torque_limit=c.torque_limit,
+                hold,
+                stiffness=self.config.reset_hold_stiffness,
             )
-            return torch.where(present, values, torch.zeros_like(values))
+            if assist is not None:
+                total = total + assist_wrench(
+                    pose,
+                    vel,
+                    ref_pose,
+                    ref_vel,
+                    inertia,
+                    self.assist_kp,
+                    self.assist_kv,
+                    torque_ratio=assist.config.torque_ratio,
+                    force_limit=assist.config.force_limit,
+                    torque_limit=assist.config.torque_limit,
+                )
+            return torch.where(present, total, torch.zeros_like(total))
 
         return wrench
 
+    def _hold_share(self) -> Tensor:
+        """Share of the grip hold left in each world, 1 after a reset, then 0, (N,)."""
+        steps = self.config.reset_hold_s / self.step_dt
+        if steps <= 0:
+            return torch.zeros(self.num_envs)
+        share = (1.0 - self.steps / steps).clamp_min(0.0)
+        return torch.where(self.attempt, torch.zeros_like(share), share)
+
     def _observation(self, state: TensorDictBase) -> TensorDict:
-        kin = self.kinematics(state[keys.JOINT_POS], None)
-        wrench = state[keys.CONTACT]
-        force = quat_rotate_inverse(kin["link_quat"], wrench[..., :3])
-        lever = wrench[..., 3:] - kin["link_pos"]
-        code = encode_contact(force, quat_rotate_inverse(kin["link_quat"], lever))
         out = {
             keys.JOINT_POS: state[keys.JOINT_POS],
             keys.JOINT_VEL: state[keys.JOINT_VEL],
             keys.JOINT_TARGET: self._target.clone(),
             keys.OBJECT_POSE: state[keys.OBJECT_POSE],
             keys.OBJECT_VEL: state[keys.OBJECT_VEL],
-            keys.CONTACT: code,
+            keys.CONTACT: self._contact.clone(),
             keys.MOTION: self.motion.clone().unsqueeze(-1),
             keys.FRAME: self.frame.clone().unsqueeze(-1),
             keys.ATTEMPT: self.attempt.clone().unsqueeze(-1),

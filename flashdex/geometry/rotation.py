@@ -63,12 +63,6 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    ax, ay, az = a.unbind(-1)
-    bx, by, bz = b.unbind(-1)
-    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
-
-
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors: ``v + 2 w (u x v) + 2 u x (u x v)`` with ``q = (w, u)``.
 
@@ -79,9 +73,9 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     Returns:
         Rotated vectors, (..., 3).
     """
-    u = q[..., 1:]
-    t = 2 * _cross(u, v)
-    return v + q[..., :1] * t + _cross(u, t)
+    u, v = torch.broadcast_tensors(q[..., 1:], v)
+    t = 2 * torch.linalg.cross(u, v)
+    return v + q[..., :1] * t + torch.linalg.cross(u, t)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:

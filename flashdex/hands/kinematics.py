@@ -98,7 +98,8 @@ class HandKinematics(nn.Module):
             ``wrist_angvel`` (3); ``link_linvel`` of the link origins, ``link_angvel``
             (L, 3); ``tip_linvel`` of the tracking points (5, 3).
         """
-        (pos, quat), arms = self._poses(joint_pos)
+        turns = self._wrist_turns(joint_pos)
+        (pos, quat), arms = self._poses(joint_pos, turns)
         tip_quat = quat[..., self.tip_link, :]
         tip_arm = quat_rotate(tip_quat, self.tip_pos)
         tip_origin = pos[..., self.tip_link, :]
@@ -111,7 +112,7 @@ class HandKinematics(nn.Module):
             "tip_center": tip_origin + quat_rotate(tip_quat, self.tip_center),
         }
         if joint_vel is not None:
-            linvel, angvel = self._velocities(joint_pos, joint_vel, quat, arms)
+            linvel, angvel = self._velocities(turns, joint_vel, quat, arms)
             turn = torch.linalg.cross(angvel[..., self.tip_link, :], tip_arm)
             out["wrist_linvel"] = linvel[..., 0, :]
             out["wrist_angvel"] = angvel[..., 0, :]
@@ -120,13 +121,13 @@ class HandKinematics(nn.Module):
             out["tip_linvel"] = linvel[..., self.tip_link, :] + turn
         return TensorDict(out, batch_size=joint_pos.shape[:-1])
 
-    def _poses(self, joint_pos: Tensor) -> tuple[Pose, list[Tensor]]:
+    def _poses(self, joint_pos: Tensor, turns: Tensor) -> tuple[Pose, list[Tensor]]:
         # also returns the lever arms of the levels, world axes, for the velocities
         angle = joint_pos[..., self.link_joint]
         local = quat_mul(self.link_quat, quat_from_axis_angle(self.link_axis, angle))
         slides = joint_pos[..., :3, None] * self.wrist_axes[:, :3]
         pos = [slides.sum(-2, keepdim=True)]
-        quat = [self._wrist_turns(joint_pos)[..., -1:, :]]
+        quat = [turns[..., -1:, :]]
         arms = []
         for level in self._levels[1:]:
             slot = self.link_slot[level]
@@ -137,11 +138,10 @@ class HandKinematics(nn.Module):
         return (self._sort(pos), self._sort(quat)), arms
 
     def _velocities(
-        self, joint_pos: Tensor, joint_vel: Tensor, quat: Tensor, arms: list[Tensor]
+        self, turns: Tensor, joint_vel: Tensor, quat: Tensor, arms: list[Tensor]
     ) -> Twist:
         # v_c = v_p + w_p x (p_c - p_p);  w_c = w_p + R_c a q'. A hinge does not move
         # its own axis, so the orientation after the turn serves.
-        turns = self._wrist_turns(joint_pos)
         wrist_spin = quat_rotate(turns, self.wrist_axes[:, 3:])
         wrist_spin = wrist_spin * joint_vel[..., 3:NUM_WRIST_JOINTS, None]
         slides = joint_vel[..., :3, None] * self.wrist_axes[:, :3]

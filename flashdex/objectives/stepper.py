@@ -28,7 +28,9 @@ class FlashSACStepper:
         lr: first learning rate.
         lr_end: last learning rate.
         total_updates: critic updates of the run; None keeps ``lr``.
+        actor_lr_scale: factor on the actor's learning rates.
         actor_period: updates between two actor steps.
+        actor_delay: critic updates before the first actor step.
         tau: rate of the target average.
         generator: source of the policy noise; None is the global one.
         compile: compile the two objectives.
@@ -45,17 +47,23 @@ class FlashSACStepper:
         lr: float = 3e-4,
         lr_end: float = 1.5e-4,
         total_updates: int | None = None,
+        actor_lr_scale: float = 1.0,
         actor_period: int = 2,
+        actor_delay: int = 0,
         tau: float = 0.01,
         generator: torch.Generator | None = None,
         compile: bool = False,
     ) -> None:
         self.loss = loss
-        self.actor_period = actor_period
+        self.actor_period, self.actor_delay = actor_period, actor_delay
         self.generator = generator
         self.updates = 0
         rates = {"peak": lr, "end": lr_end, "total": total_updates}
-        self.actor_optimizer = ScheduledAdam(loss.actor_network.parameters(), **rates)
+        scale = actor_lr_scale
+        actor_rates = {**rates, "peak": scale * lr, "end": scale * lr_end}
+        self.actor_optimizer = ScheduledAdam(
+            loss.actor_network.parameters(), **actor_rates
+        )
         self.alpha_optimizer = ScheduledAdam([loss.log_alpha], **rates)
         self.critic_optimizer = ScheduledAdam(loss.qvalue_network.parameters(), **rates)
         self.target_average = TargetAverage(
@@ -89,7 +97,8 @@ class FlashSACStepper:
             repeated.
         """
         batch = self.loss.read(tensordict)
-        if self.updates % self.actor_period == 0:
+        waited = self.updates >= self.actor_delay
+        if waited and self.updates % self.actor_period == 0:
             self._actor_step(batch, self._draw(batch, actor_noise))
         noise = self._draw(batch, target_noise)
         qvalue, critic_metrics = self._qvalue_objective(batch, noise)

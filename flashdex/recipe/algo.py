@@ -70,8 +70,14 @@ class AlgoConfig:
     """Learning rate at the start."""
     lr_final: float = number(1.5e-4, low=0)
     """Learning rate at the end of the cosine."""
+    actor_lr_scale: float = number(1.0, above=0)
+    """Actor's learning rate over the critic's; below 1 the actor waits for the critic,
+    which helps when there are few updates in all."""
     actor_period: int = number(2, low=1)
     """Critic updates an actor update."""
+    actor_delay: int = number(0, low=0)
+    """Critic updates before the first actor update; 0 = as published. With few updates
+    in all, an untrained critic drives the actor into saturation first."""
     alpha_init: float = number(0.01, above=0)
     """Temperature at the start, each group."""
     target_std: float = number(0.15, above=0)

@@ -181,6 +181,11 @@ class EnvConfig:
     """Start training episodes at random frames; off, always at frame 0."""
     reset_noise: ResetNoise = dataclasses.field(default_factory=ResetNoise)
     """Noise on the start state of training worlds."""
+    reset_hold_s: float = number(0.0, low=0)
+    """Seconds for which objects are carried along after a reset, fading, while the
+    grip forms; 0 = off, as released. Never in attempt worlds."""
+    reset_hold_stiffness: float = number(40.0, above=0, high=100)
+    """Natural frequency of that hold, rad/s."""
     sampler: Literal["uniform", "unconverted"] = "uniform"
     """How resets draw motions; unconverted favours those not yet converted."""
     attempt_share: float = number(0.125, low=0, high=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -205,8 +206,12 @@ class AttemptRecorder:
         return np.stack(ours, 1), np.stack(theirs, 1), bodies
 
 
-def versions() -> dict[str, Any]:
-    """Package versions and engine that produced a rollout."""
+def versions(engine: str = "cpu") -> dict[str, Any]:
+    """Package versions, engine and hardware that produce a rollout.
+
+    Args:
+        engine: physics engine of the recipe.
+    """
     names = ("flashdex", "torch", "torchrl", "tensordict")
     found: dict[str, Any] = {}
     for name in names:
@@ -214,4 +219,10 @@ def versions() -> dict[str, Any]:
             found[name] = version(name)
         except ModuleNotFoundError:
             found[name] = "source"
-    return {**found, "mujoco": mujoco.__version__, "python": platform.python_version()}
+    return {
+        **found,
+        "mujoco": mujoco.__version__,
+        "python": platform.python_version(),
+        "engine": engine,
+        "hardware": f"{platform.machine()}, {os.cpu_count()} CPU cores",
+    }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flashdex import keys
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
 from flashdex.training.attempts import Attempt
@@ -119,6 +120,11 @@ class Ledger:
             "errors": {k: round(v, 6) for k, v in verdict.values.items()},
             "passed": [k for k, v in verdicts.items() if v.is_passed],
             "completed": attempt.completed,
+            "hands": [
+                side
+                for side, on in zip(keys.SIDES, rollout.hand_active, strict=True)
+                if on
+            ],
             "why": _why(attempt, verdict.reason, verdict.blame),
             "frame": attempt.frame,
             "env_steps": env_steps,

@@ -69,7 +69,10 @@ def _replay_one(file: Path) -> Replayed:
     path = file.with_suffix(".certificate.json")
     if not path.is_file():
         return Replayed(rollout.motion, None, found.verdict, agrees=True)
-    stored = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RunError(f"{path}: not JSON ({error}). Restore or delete it.") from error
     agrees = stored["verdict"] == found.verdict and _same_numbers(
         stored["nominal"], json.loads(found.to_json())["nominal"]
     )

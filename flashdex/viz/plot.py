@@ -64,11 +64,7 @@ def line_chart(
     """
     curves = [(s.name, s.points()) for s in series]
     curves = [(name, points) for name, points in curves if points]
-    name = escape(f"{title}, {y_label}" if y_label else title)
-    head = (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{name}">'
-        f'<text x="{LEFT}" y="16" class="t">{name}</text>'
-    )
+    head = _head(f"{title}, {y_label}" if y_label else title)
     if not curves:
         middle = f'x="{WIDTH // 2}" y="{HEIGHT // 2}" text-anchor="middle"'
         return f"{head}<text {middle}>no data yet</text></svg>"
@@ -78,6 +74,14 @@ def line_chart(
         shown = _steps(points) if is_step else _thin(points)
         body += scale.polyline(shown, index)
     return head + body + _legend([name for name, _ in curves]) + "</svg>"
+
+
+def _head(title: str) -> str:
+    name = escape(title)
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{name}">'
+        f'<text x="{LEFT}" y="16" class="t">{name}</text>'
+    )
 
 
 @dataclass(frozen=True)

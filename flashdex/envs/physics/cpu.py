@@ -96,9 +96,7 @@ class CpuPhysics:
             return
         rows = motion.cpu().numpy()
         self._motion[ids] = rows
-        for env, row in zip(ids.tolist(), rows.tolist(), strict=True):
-            self._models[env] = self.scenes[row].model
-        self.batch.set_models(self._models)
+        self._set_models(ids, rows)
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         active = self._active[rows]
         qpos = np.where(active[..., None], joint_pos.double().numpy(), self._parked)
@@ -110,6 +108,13 @@ class CpuPhysics:
         self._write_objects(ids, rows, object_pose, object_vel)
         self.batch.forward(ids=ids)
         self._bad_before[ids] = self._bad_count()[ids]
+
+    def _set_models(self, ids: np.ndarray, rows: np.ndarray) -> None:
+        before = list(self._models)
+        for env, row in zip(ids.tolist(), rows.tolist(), strict=True):
+            self._models[env] = self.scenes[row].model
+        if any(a is not b for a, b in zip(before, self._models, strict=True)):
+            self.batch.set_models(self._models)
 
     def step(self, target: Tensor, wrench: WrenchFn | None = None) -> None:
         """Advance one control step; see ``Physics.step``."""

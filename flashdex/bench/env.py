@@ -1,0 +1,197 @@
+"""``flashdex bench env``: the tracking environment against bare ``mujoco.batch``.
+
+Both step the very same models from the same states under the same controls, by turns
+in one process, so that what else runs on the machine slows both alike. The ratio is
+what the environment costs: 1 would be nothing but physics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from tensordict import TensorDictBase
+
+from flashdex import keys
+from flashdex.envs.physics.cpu import CpuPhysics
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.recipe import compose
+from flashdex.training.setup import open_workbench
+
+SEGMENT = 10  # control steps by which the two take turns, from equal states
+BURN_IN = 4  # segments that are not counted
+STATE = ("qpos", "qvel", "qacc_warmstart")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Seconds that one segment took.
+
+    Attributes:
+        env: environment steps with their resets, s.
+        physics: the same controls on bare physics, s.
+    """
+
+    env: float
+    physics: float
+
+
+class Duel:
+    """The environment and a bare batch that follows it segment by segment.
+
+    Args:
+        env: environment on the cpu engine.
+        num_threads: threads of the bare batch; as the environment's.
+        seed: of the random actions.
+    """
+
+    def __init__(self, env: TrackingEnv, *, num_threads: int, seed: int = 0) -> None:
+        assert isinstance(env.physics, CpuPhysics)
+        self.env, self.physics = env, env.physics
+        model = self.physics.scene(0).model
+        self.bare = Batch(model, nsim=env.num_envs, nthread=num_threads)
+        self.ctrl = self.bare.bind("ctrl")
+        # Derived fields that are bound are copied out; the environment binds these.
+        self.sensordata = self.bare.bind("sensordata")
+        self.generator = torch.Generator().manual_seed(seed)
+        self.td = env.reset()
+
+    def run(self) -> Segment:
+        """One segment of each, from equal states."""
+        self._follow()
+        actions = self._draw()
+        controls, spent = [], 0.0
+        for action in actions:
+            start = time.perf_counter()
+            self.td = self._env_step(action)
+            spent += time.perf_counter() - start
+            controls.append(np.array(self.physics.batch.bind("ctrl")))
+        start = time.perf_counter()
+        for ctrl in controls:
+            self.ctrl[:] = ctrl
+            self.bare.step(nstep=self.physics.decimation)
+        return Segment(spent, time.perf_counter() - start)
+
+    def _follow(self) -> None:
+        envs = range(self.env.num_envs)
+        self.bare.set_models([self.physics.scene(e).model for e in envs])
+        for name in STATE:
+            self.bare.bind(name)[:] = self.physics.batch.bind(name)
+
+    def _draw(self) -> torch.Tensor:
+        shape = (SEGMENT, 2, self.env.num_envs, self.env.bank.num_joints)
+        return 2 * torch.rand(shape, generator=self.generator) - 1
+
+    def _env_step(self, action: torch.Tensor) -> TensorDictBase:
+        for side, value in zip(keys.SIDES, action, strict=True):
+            self.td.set(keys.action(side), value)
+        return self.env.step_and_maybe_reset(self.td)[1]
+
+
+def measure(env: TrackingEnv, *, num_threads: int, seconds: float) -> dict[str, Any]:
+    """Let both take turns for some seconds.
+
+    Args:
+        env: environment on the cpu engine.
+        num_threads: threads of the engine, 0 for all cores.
+        seconds: how long to measure, burn-in excluded.
+
+    Returns:
+        env_steps_per_s, physics_env_steps_per_s, ratio (medians over segments) and
+        the number of segments.
+    """
+    duel = Duel(env, num_threads=num_threads)
+    for _ in range(BURN_IN):
+        duel.run()
+    segments: list[Segment] = []
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end or len(segments) < 3:
+        segments.append(duel.run())
+    steps = SEGMENT * env.num_envs
+    return {
+        "env_steps_per_s": round(steps / median(s.env for s in segments), 1),
+        "physics_env_steps_per_s": round(
+            steps / median(s.physics for s in segments), 1
+        ),
+        "ratio": round(median(s.physics / s.env for s in segments), 4),
+        "segments": len(segments),
+    }
+
+
+def main(words: list[str] | None = None) -> dict[str, Any]:
+    """Measure, and print one JSON object.
+
+    Args:
+        words: ``--recipe NAME``, ``--num-envs N``, ``--seconds S``, and ``key=value``
+            overrides of the recipe.
+
+    Returns:
+        The printed object.
+    """
+    args = _parse(words or [])
+    overrides = list(args.overrides)
+    if args.num_envs is not None:
+        overrides.append(f"env.num_envs={args.num_envs}")
+    recipe = compose(args.recipe, overrides)
+    env = open_workbench(recipe).make_env()
+    threads = recipe.physics.num_threads
+    result = {
+        "benchmark": "env",
+        "recipe": recipe.name,
+        "num_envs": env.num_envs,
+        "decimation": recipe.physics.decimation,
+        **measure(env, num_threads=threads, seconds=args.seconds),
+        "torch_threads": torch.get_num_threads(),
+        "hardware": describe_hardware(),
+        "commit": describe_commit(),
+    }
+    sys.stdout.write(json.dumps(result) + "\n")
+    return result
+
+
+def _parse(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="flashdex bench env")
+    parser.add_argument("--recipe", default="quickstart", help="name or path")
+    parser.add_argument("--num-envs", type=int, help="worlds; the recipe's if absent")
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long")
+    parser.add_argument("--json", action="store_true", help="always so")
+    parser.add_argument("overrides", nargs="*", metavar="key=value")
+    return parser.parse_intermixed_args(words)
+
+
+def describe_hardware() -> str:
+    """Processor and number of cores."""
+    name = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        lines = info.read_text(encoding="utf-8").splitlines()
+        models = [
+            x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")
+        ]
+        name = models[0] if models else name
+    return f"{name}, {torch.multiprocessing.cpu_count()} cores"
+
+
+def describe_commit() -> str:
+    """Commit of the source tree, ``+`` when it was changed; empty outside of git."""
+    folder = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words], cwd=folder, capture_output=True, text=True, check=False
+        )
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    commit = git("rev-parse", "--short", "HEAD")
+    return commit + ("+" if commit and git("status", "--porcelain", "-uno") else "")

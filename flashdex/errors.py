@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class FlashdexError(Exception):
-    """Base of all errors caused by input; the command line turns it into exit code 2."""
+    """Base of all errors caused by input; the command line exits with 2 on them."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -37,6 +37,7 @@ ATTEMPT = "attempt"  # (N, 1) bool, world that starts at frame 0 without assist
 # -- what the transforms assemble ---------------------------------------------
 KIN = "kin"  # forward kinematics of both hands
 REF = "ref"  # reference frame shown to the policy
+OWN = "own"  # each hand's own object: pos, quat, vel, row, present
 BLOCKS = "blocks"  # one observation block per named transform
 OBSERVATION = "observation"  # (N, D) the blocks side by side
 FUTURE = "future"  # (N, 2 * 39, K) future window

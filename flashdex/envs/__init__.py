@@ -1,0 +1,1 @@
+"""The tracking environment: scenes, physics, features, rewards, terminations."""

@@ -261,7 +261,7 @@ def future_window(
         position 3, rotation 6, fingertips 15; all in the current wrist frame. Rotations
         are the first two columns of ``R_w^T R_ref R_cur^T R_w``.
     """
-    n, frames = vectors.shape[:2]
+    frames = vectors.shape[1]
     wrist = quat_to_matrix(kin["wrist_quat"])
     linear, angular = own_vel.split(3, -1)
     now = torch.stack([own_pos, linear, angular, kin["wrist_pos"]], -2)
@@ -276,7 +276,7 @@ def future_window(
     turned = rotations.permute(0, 2, 3, 1, 4, 5).flatten(3, 4)
     turned = (turned @ wrist.unsqueeze(2)).unflatten(3, (frames, 3)).mT
     rot = (turned.flatten(3, 4) @ columns).unflatten(3, (frames, 3))
-    # Column 1 before column 2, as in quat_to_rot6d.
+    # Column 1 before column 2.
     rot = rot.mT.flatten(-2)
     parts = [
         delta[..., 0, :],

@@ -56,7 +56,7 @@ class Judge:
     def __init__(
         self,
         bank: ReferenceBank,
-        hands: dict[str, HandSpec],
+        hands: dict[keys.Side, HandSpec],
         config: EnvConfig,
         *,
         step_dt: float,

@@ -43,7 +43,24 @@ class ReferenceBank(nn.Module):
         hand_object: object row of each hand, 0 where it has none, (M, 2) int64.
     """
 
-    def __init__(self, library: MotionLibrary, hands: dict[str, HandSpec]) -> None:
+    table: Tensor  # (F, all columns)
+    future: Tensor  # (F, 2 * 45)
+    start: Tensor  # (M,)
+    length: Tensor  # (M,)
+    hand_active: Tensor  # (M, 2)
+    has_object: Tensor  # (M, 2)
+    hand_slot: Tensor  # (M, 2)
+    hand_object: Tensor  # (M, 2)
+    object_index: Tensor  # (M, O)
+    points: Tensor  # object frame, m, (Q, P, 3)
+    radius: Tensor  # m, (Q,)
+    mass: Tensor  # kg, (Q,)
+    inertia: Tensor  # about the mass centre, object axes, kg m^2, (Q, 3, 3)
+    com: Tensor  # object frame, m, (Q, 3)
+
+    def __init__(
+        self, library: MotionLibrary, hands: dict[keys.Side, HandSpec]
+    ) -> None:
         super().__init__()
         self._fields: dict[str, _Field] = {}
         frames, motions = library.frames, _plain(library.motions)
@@ -95,7 +112,9 @@ class ReferenceBank(nn.Module):
         """Joints of one hand, wrist included."""
         return self._fields["joint_pos"].shape[-1]
 
-    def at(self, motion: Tensor, frame: Tensor, names: tuple[str, ...] = ()) -> TensorDict:
+    def at(
+        self, motion: Tensor, frame: Tensor, names: tuple[str, ...] = ()
+    ) -> TensorDict:
         """Gather reference frames; frames past the end clamp to the last one.
 
         Args:
@@ -117,7 +136,9 @@ class ReferenceBank(nn.Module):
         }
         return TensorDict(out, batch_size=index.shape)
 
-    def window(self, motion: Tensor, frame: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+    def window(
+        self, motion: Tensor, frame: Tensor, horizon: int
+    ) -> tuple[Tensor, Tensor]:
         """Gather ``horizon`` consecutive frames that begin at ``frame``.
 
         Args:
@@ -127,8 +148,8 @@ class ReferenceBank(nn.Module):
 
         Returns:
             Vectors (N, K, 2, 9, 3): object position, linear and angular velocity, wrist
-            position, five fingertips; and the transposed rotation matrices of object and
-            wrist, (N, K, 2, 2, 3, 3). World frame.
+            position, five fingertips; and the transposed rotation matrices of object
+            and wrist, (N, K, 2, 2, 3, 3). World frame.
         """
         steps = torch.arange(horizon, device=frame.device)
         frames = frame.unsqueeze(-1) + steps
@@ -140,7 +161,7 @@ class ReferenceBank(nn.Module):
         return vectors.unflatten(-1, (9, 3)), rotations.unflatten(-1, (2, 3, 3))
 
     def _columns(
-        self, frames: TensorDict, slot: Tensor, hands: dict[str, HandSpec]
+        self, frames: TensorDict, slot: Tensor, hands: dict[keys.Side, HandSpec]
     ) -> dict[str, Tensor]:
         take = slot.clamp_min(0)
 

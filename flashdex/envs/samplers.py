@@ -2,22 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
-
-
-class MotionSampler(Protocol):
-    """Draws motions for resets."""
-
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return motion rows, (count,) int64."""
-        ...
-
-    def mark_converted(self, motion: int) -> None:
-        """Learn that a motion has been converted."""
-        ...
 
 
 class UniformSampler:

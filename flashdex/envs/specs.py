@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Size
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from flashdex import keys
@@ -21,15 +22,15 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
     n = num_envs
     whole = torch.int64
     leaves = {
-        keys.JOINT_POS: Unbounded((n, 2, joints)),
-        keys.JOINT_VEL: Unbounded((n, 2, joints)),
-        keys.JOINT_TARGET: Unbounded((n, 2, joints)),
-        keys.OBJECT_POSE: Unbounded((n, slots, 7)),
-        keys.OBJECT_VEL: Unbounded((n, slots, 6)),
-        keys.CONTACT: Unbounded((n, 2, links, CODE_WIDTH), dtype=torch.int8),
-        keys.MOTION: Unbounded((n, 1), dtype=whole),
-        keys.FRAME: Unbounded((n, 1), dtype=whole),
-        keys.ATTEMPT: Binary(1, (n, 1), dtype=torch.bool),
+        keys.JOINT_POS: Unbounded(Size((n, 2, joints))),
+        keys.JOINT_VEL: Unbounded(Size((n, 2, joints))),
+        keys.JOINT_TARGET: Unbounded(Size((n, 2, joints))),
+        keys.OBJECT_POSE: Unbounded(Size((n, slots, 7))),
+        keys.OBJECT_VEL: Unbounded(Size((n, slots, 6))),
+        keys.CONTACT: Unbounded(Size((n, 2, links, CODE_WIDTH)), dtype=torch.int8),
+        keys.MOTION: Unbounded(Size((n, 1)), dtype=whole),
+        keys.FRAME: Unbounded(Size((n, 1)), dtype=whole),
+        keys.ATTEMPT: Binary(1, Size((n, 1)), dtype=torch.bool),
     }
     return Composite(leaves, shape=(n,))
 
@@ -38,7 +39,7 @@ def action_spec(num_envs: int, joints: int) -> Composite:
     """Actions of both hands in [-1, 1], (N, J) each."""
     n = num_envs
     sides = {
-        s: Composite({keys.ACTION: Bounded(-1.0, 1.0, (n, joints))}, shape=(n,))
+        s: Composite({keys.ACTION: Bounded(-1.0, 1.0, Size((n, joints)))}, shape=(n,))
         for s in keys.SIDES
     }
     return Composite(sides, shape=(n,))
@@ -48,7 +49,8 @@ def reward_spec(num_envs: int) -> Composite:
     """Rewards of both hands, (N, 1) each."""
     n = num_envs
     sides = {
-        s: Composite({keys.REWARD: Unbounded((n, 1))}, shape=(n,)) for s in keys.SIDES
+        s: Composite({keys.REWARD: Unbounded(Size((n, 1)))}, shape=(n,))
+        for s in keys.SIDES
     }
     return Composite(sides, shape=(n,))
 
@@ -57,5 +59,5 @@ def done_spec(num_envs: int) -> Composite:
     """Flags at the root, (N, 1) each."""
     n = num_envs
     names = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-    flags = {name: Binary(1, (n, 1), dtype=torch.bool) for name in names}
+    flags = {name: Binary(1, Size((n, 1)), dtype=torch.bool) for name in names}
     return Composite(flags, shape=(n,))

@@ -15,7 +15,6 @@ from flashdex import keys
 from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
 from flashdex.envs.assist import AssistSchedule, assist_wrench, hold_wrench
 from flashdex.envs.contact import CODE_WIDTH, contact_code
-from flashdex.envs.features import gather_own
 from flashdex.envs.judge import Judge, Outcome
 from flashdex.envs.physics.base import Physics, WrenchFn
 from flashdex.envs.reference import ReferenceBank
@@ -57,20 +56,21 @@ class TrackingEnv(EnvBase):
         hands: hand specs by side.
         config: environment part of the recipe.
         step_dt: control step, s.
+        lead_s: how far each joint's target runs ahead of the reference, s, (2, J);
+            zero when None.
         seed: of resets and motions.
         evaluation: no terminations, every world an attempt.
     """
-
-    batch_locked = True
 
     def __init__(
         self,
         physics: Physics,
         bank: ReferenceBank,
-        hands: dict[str, HandSpec],
+        hands: dict[keys.Side, HandSpec],
         config: EnvConfig,
         *,
         step_dt: float,
+        lead_s: Tensor | None = None,
         seed: int = 0,
         evaluation: bool = False,
     ) -> None:
@@ -90,6 +90,7 @@ class TrackingEnv(EnvBase):
         )
         self.sampler = SAMPLERS[config.sampler](bank.num_motions)
         self.attempt_sampler = UnconvertedSampler(bank.num_motions)
+        self.lead_s = torch.zeros(()) if lead_s is None else lead_s
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
         scale = [config.wrist_pos_scale] * 3 + [config.wrist_rot_scale] * 3
         self._wrist_scale = torch.tensor(scale)
@@ -136,8 +137,9 @@ class TrackingEnv(EnvBase):
         self, tensordict: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:
         mask = torch.ones(self.num_envs, dtype=torch.bool)
-        if tensordict is not None and "_reset" in tensordict.keys():
-            mask = tensordict["_reset"].reshape(self.num_envs)
+        asked = None if tensordict is None else tensordict.get("_reset", None)
+        if asked is not None:
+            mask = asked.reshape(self.num_envs)
         ids = mask.nonzero().squeeze(-1)
         with few_threads(self.num_envs):
             out = self._reset_worlds(ids)
@@ -187,11 +189,13 @@ class TrackingEnv(EnvBase):
         action = torch.stack([tensordict[keys.action(s)] for s in keys.SIDES], 1)
         action = torch.nan_to_num(action).clamp(-1.0, 1.0)
         ref = self.bank.at(self.motion, self.frame)
-        self._apply(action, ref)
+        self._act(action, ref)
         state = self.physics.state()
         self.steps += 1
         kin = self.kinematics(state[keys.JOINT_POS], state[keys.JOINT_VEL])
-        outcome = self.judge(state, kin, ref, action, self._target, self.motion, self.steps)
+        outcome = self.judge(
+            state, kin, ref, action, self._target, self.motion, self.steps
+        )
         scored = self.frame.clone()
         self.info = StepInfo(outcome, scored, self.motion.clone())
         terminated = outcome.blame.any(-1, keepdim=True)
@@ -207,14 +211,14 @@ class TrackingEnv(EnvBase):
         out[keys.DONE] = terminated | truncated
         return out
 
-    def _apply(self, action: Tensor, ref: TensorDictBase) -> None:
+    def _act(self, action: Tensor, ref: TensorDictBase) -> None:
         fresh = self.steps == 0
         self._filter = lowpass(self._filter, action[..., :6], fresh, alpha=self._alpha)
         residual = self.config.finger_mode == "residual"
         self._target = joint_target(
             self._filter,
             action[..., 6:],
-            ref["joint_pos"],
+            self.leading_reference(ref),
             self.joint_range,
             wrist_scale=self._wrist_scale,
             finger_scale=self.config.finger_scale if residual else None,
@@ -222,6 +226,10 @@ class TrackingEnv(EnvBase):
         if self.target_override is not None:
             self._target = self.target_override(self)
         self.physics.step(self._target, self._wrench(ref))
+
+    def leading_reference(self, ref: TensorDictBase) -> Tensor:
+        """Reference joints ahead by the lag of the wrist servos, (N, 2, J)."""
+        return ref["joint_pos"] + self.lead_s * ref["joint_vel"]
 
     def _wrench(self, ref: TensorDictBase) -> WrenchFn | None:
         """What acts on the objects besides contact and gravity; None is nothing."""
@@ -285,9 +293,3 @@ class TrackingEnv(EnvBase):
             keys.ATTEMPT: self.attempt.clone().unsqueeze(-1),
         }
         return TensorDict(out, batch_size=self.batch_size)
-
-    def own_objects(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Pose (N, 2, 7) and velocity (N, 2, 6) of each hand's own object."""
-        slot = self.bank.hand_slot[self.motion]
-        pose = gather_own(state[keys.OBJECT_POSE], slot)
-        return pose, gather_own(state[keys.OBJECT_VEL], slot)

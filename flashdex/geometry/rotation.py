@@ -115,34 +115,6 @@ def quat_to_matrix(q: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def matrix_to_quat(m: Tensor) -> Tensor:
-    """Unit quaternion of a rotation matrix, with ``w >= 0``.
-
-    Row ``k`` of ``4 q q^T`` is read from the matrix for each ``k``; the row with the
-    largest diagonal is divided by its own length, so that no angle is singular.
-
-    Args:
-        m: rotation matrix, (..., 3, 3).
-
-    Returns:
-        Unit, wxyz, (..., 4).
-    """
-    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (
-        row.unbind(-1) for row in m.unbind(-2)
-    )
-    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
-    xy, xz, yz = m01 + m10, m02 + m20, m12 + m21
-    ww, xx = 1 + m00 + m11 + m22, 1 + m00 - m11 - m22
-    yy, zz = 1 - m00 + m11 - m22, 1 - m00 - m11 + m22
-    outer = torch.stack(
-        (ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz), dim=-1
-    ).unflatten(-1, (4, 4))
-    best = torch.stack((ww, xx, yy, zz), dim=-1).argmax(dim=-1)
-    index = best[..., None, None].expand(*best.shape, 1, 4)
-    q = quat_normalize(outer.gather(-2, index).squeeze(-2))
-    return torch.where(q[..., :1] < 0, -q, q)
-
-
 def quat_from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
     """Quaternion ``(cos(a/2), axis sin(a/2))``.
 
@@ -212,48 +184,6 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
     return 2 * torch.atan2(sine, delta[..., 0].abs())
 
 
-def quat_slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
-    """Constant-speed way from ``a`` to ``b`` on the shorter arc.
-
-    ``a exp(t log(conj(a) b))``: exact at both ends and without a small-angle case.
-
-    Args:
-        a: unit, wxyz, (..., 4), returned at ``t = 0``.
-        b: unit, wxyz, (..., 4), reached up to sign at ``t = 1``.
-        t: share of the way, a number or (...).
-
-    Returns:
-        Unit, wxyz, (..., 4).
-    """
-    delta = quat_to_rotvec(quat_mul(quat_conj(a), b))
-    step = t[..., None] * delta if isinstance(t, Tensor) else t * delta
-    return quat_mul(a, quat_from_rotvec(step))
-
-
-def matrix_to_rot6d(m: Tensor) -> Tensor:
-    """First column, then second column, of a rotation matrix.
-
-    Args:
-        m: rotation matrix, (..., 3, 3).
-
-    Returns:
-        (..., 6).
-    """
-    return torch.cat((m[..., :, 0], m[..., :, 1]), dim=-1)
-
-
-def quat_to_rot6d(q: Tensor) -> Tensor:
-    """First column, then second column, of the rotation matrix of ``q``.
-
-    Args:
-        q: unit, wxyz, (..., 4).
-
-    Returns:
-        (..., 6).
-    """
-    return matrix_to_rot6d(quat_to_matrix(q))
-
-
 def transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
     """Body to world: ``R p + pos``.
 
@@ -266,17 +196,3 @@ def transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
         Points in the world, m, (..., P, 3).
     """
     return points @ quat_to_matrix(quat).mT + pos[..., None, :]
-
-
-def inverse_transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
-    """World to body: ``R^T (p - pos)``.
-
-    Args:
-        pos: body origin, world, m, (..., 3).
-        quat: body orientation, unit, wxyz, (..., 4).
-        points: in the world, m, (..., P, 3).
-
-    Returns:
-        Points in the body frame, m, (..., P, 3).
-    """
-    return (points - pos[..., None, :]) @ quat_to_matrix(quat)

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
-from flashdex.hands.spec import HandError, HandSpec, Side, load_hand
+from flashdex.hands.spec import HandError, HandSpec, load_hand
+from flashdex.keys import Side
 
 # Five virtual links carry the wrist joints; the sixth joint sits on the base itself.
 VIRTUAL_MASS = 0.1  # kg

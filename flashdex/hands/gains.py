@@ -91,3 +91,17 @@ def critical_kv(kp: float, inertia: float) -> float:
         Damping, N m s/rad.
     """
     return 2.0 * float(np.sqrt(kp * inertia))
+
+
+def servo_lag(gains: Gains) -> NDArray[np.float64]:
+    """Time by which each servo trails a target that moves steadily.
+
+    ``kp (target - q) = (kv + damping) q'`` gives ``lag = (kv + damping) / kp``.
+
+    Args:
+        gains: servos of a hand.
+
+    Returns:
+        s, (J,).
+    """
+    return (gains.kv + gains.damping) / gains.kp

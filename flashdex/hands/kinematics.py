@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from flashdex.geometry.rotation import quat_from_axis_angle, quat_mul, quat_rotate
 from flashdex.hands.gains import NUM_WRIST_JOINTS
-from flashdex.hands.spec import SIDES, HandError, HandSpec, Side
+from flashdex.hands.spec import HandError, HandSpec
+from flashdex.keys import SIDES, Side
 
 Pose = tuple[Tensor, Tensor]
 Twist = tuple[Tensor, Tensor]

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from types import ModuleType
-from typing import Literal
 
 import mujoco
 import numpy as np
@@ -15,10 +14,8 @@ from numpy.typing import NDArray
 
 from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
+from flashdex.keys import FINGERS, SIDES, Side
 
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
-FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 HANDS = ("xhand",)
 
 # Six joints move the base: three slides, then hinges about z, x and -y. (name, axis)

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from flashdex.files import write_atomic
 from flashdex.metrics.criteria import resolve_criterion, score
 from flashdex.metrics.perturbation import Perturbation, perturb
 from flashdex.metrics.resimulation import (
@@ -85,11 +84,7 @@ class Certificate:
             path: target, usually beside the rollout as ``<motion>.certificate.json``.
         """
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "w") as file:
-            file.write(self.to_json() + "\n")
-        os.replace(temporary, path)
+        write_atomic(path, self.to_json() + "\n")
         return path
 
 

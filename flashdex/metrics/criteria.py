@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from flashdex.keys import SIDES, Side
 from flashdex.metrics.criteria_table import (
     Criterion,
     Limits,
@@ -24,7 +25,7 @@ from flashdex.metrics.signals import (
     centred_position_error,
     reference_drift,
 )
-from flashdex.metrics.verdict import SIDES, Blame, Side, Verdict
+from flashdex.metrics.verdict import Blame, Verdict
 
 __all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "score"]
 

@@ -15,11 +15,10 @@ import mujoco
 import numpy as np
 
 from flashdex.errors import RunError
+from flashdex.keys import FINGERS, SIDES
 from flashdex.metrics.rollout import Rollout
 from flashdex.metrics.signals import Signals, compute_signals
-from flashdex.metrics.verdict import SIDES
 
-FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200
 # MuJoCo goes on after these, with contacts dropped or controls set to zero

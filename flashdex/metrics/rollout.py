@@ -7,8 +7,6 @@ pickle is written or read.
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 import zipfile
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import RunError
+from flashdex.files import open_atomic
 from flashdex.metrics.rollout_schema import (
     ROLLOUT_SCHEMA,
     SHAPES,
@@ -179,17 +178,10 @@ class Rollout:
         """
         self.validate(where=str(path))
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         arrays = {f.name: getattr(self, f.name) for f in fields(self)}
         arrays = {k: v for k, v in arrays.items() if v is not None}
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, schema=ROLLOUT_SCHEMA, **arrays)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with open_atomic(path) as file:
+            np.savez_compressed(file, schema=ROLLOUT_SCHEMA, **arrays)
         return path
 
     @classmethod

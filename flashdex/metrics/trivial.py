@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from torch import Tensor
 
 from flashdex.metrics.signals import Signals, compute_signals
-from flashdex.metrics.verdict import Verdict
 
 
 def frozen_object(
@@ -38,17 +37,3 @@ def frozen_object(
     return compute_signals(
         data, hand_active=hand_active, hand_object=hand_object, fps=fps
     )
-
-
-def trivial_tags(*baselines: Mapping[str, Verdict]) -> list[str]:
-    """Tags ``trivial:<criterion>`` for criteria that any given baseline passes.
-
-    Args:
-        baselines: scores of ``frozen_object``, ``do_nothing``, ...
-    """
-    names = dict.fromkeys(name for scores in baselines for name in scores)
-    return [
-        f"trivial:{name}"
-        for name in names
-        if any(name in scores and scores[name].is_passed for scores in baselines)
-    ]

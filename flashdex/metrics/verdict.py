@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from flashdex.keys import SIDES, Side
+
 State = Literal["passed", "failed", "not_measured"]
 CertificateVerdict = Literal["certified", "robust", "failed", "not_measured"]
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
 
 
 @dataclass(frozen=True)

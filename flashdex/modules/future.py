@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -40,7 +41,7 @@ class FutureEncoder(nn.Module):
         *,
         num_frames: int = 10,
         latent_dim: int = 128,
-        widths: tuple[int, int, int] = (128, 64, 32),
+        widths: Sequence[int] = (128, 64, 32),
         ensemble: int = 1,
     ) -> None:
         super().__init__()

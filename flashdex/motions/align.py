@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from flashdex.errors import DemoError
+from flashdex.keys import SIDES
 from flashdex.motions.contacts import (
     NO_OBJECT,
     assign_object,
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.demo import SIDES, DemoObject, HumanDemo
+from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
-from flashdex.motions.meshes import clean_mesh, load_mesh
+from flashdex.motions.meshes import clean_mesh
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import (
     continuous,
@@ -81,7 +81,7 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
         demo: validated.
         control_hz: frames a second of the result.
     """
-    meshes = [_mesh(body) for body in demo.objects]
+    meshes = [clean_mesh(body.load_mesh(), name=body.name) for body in demo.objects]
     turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
     poses = [transform_pose(b.pose, turn) for b in demo.objects]
     height, found = demo.support_z, True
@@ -113,13 +113,6 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
         support_z=float(height),
         support_found=found,
     )
-
-
-def _mesh(body: DemoObject) -> trimesh.Trimesh:
-    mesh = body.mesh
-    if not isinstance(mesh, trimesh.Trimesh):
-        mesh = load_mesh(Path(mesh))
-    return clean_mesh(mesh, name=body.name)
 
 
 def _hands(

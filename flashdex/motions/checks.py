@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from flashdex.geometry.sdf import SdfGrid
+from flashdex.keys import TIP_KEYPOINTS
 from flashdex.motions.align import AlignedDemo
-from flashdex.motions.demo import TIP_KEYPOINTS, HumanDemo
+from flashdex.motions.demo import HumanDemo
 from flashdex.motions.objects import ObjectAsset
 from flashdex.motions.penetration import Penetration
 from flashdex.motions.support import lowest_points, runs, still_runs
@@ -226,8 +227,7 @@ def check_retarget(
 
 def _check_acceleration(aligned: AlignedDemo) -> list[Finding]:
     wrist = aligned.keypoints[:, aligned.active, 0]
-    kernel = np.ones(3) / 3
-    smooth = np.apply_along_axis(np.convolve, 0, wrist, kernel, mode="valid")
+    smooth = (wrist[:-2] + wrist[1:-1] + wrist[2:]) / 3
     rate = np.gradient(np.gradient(smooth, axis=0), axis=0) * aligned.fps**2
     largest = float(np.linalg.norm(rate, axis=-1).max())
     if largest <= WRIST_ACCELERATION:

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from flashdex.motions.demo import TIP_KEYPOINTS
+from flashdex.keys import TIP_KEYPOINTS
 from flashdex.motions.signed_distance import surface_distance
 from flashdex.motions.support import runs
 from flashdex.motions.tracks import rotation

@@ -10,11 +10,9 @@ import numpy as np
 import trimesh
 
 from flashdex.errors import DemoError
+from flashdex.keys import SIDES, Side
+from flashdex.motions.meshes import load_mesh
 
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
-TIP_KEYPOINTS = (4, 8, 12, 16, 20)
-NUM_KEYPOINTS = 21
 MIN_FRAMES = 10
 MIN_SECONDS = 0.5
 QUAT_TOLERANCE = 1e-2
@@ -33,6 +31,12 @@ class DemoObject:
     name: str
     mesh: Path | trimesh.Trimesh
     pose: np.ndarray
+
+    def load_mesh(self) -> trimesh.Trimesh:
+        """The mesh, read from its file if it is given as one; not cleaned."""
+        if isinstance(self.mesh, trimesh.Trimesh):
+            return self.mesh
+        return load_mesh(self.mesh)
 
 
 @dataclass

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from flashdex.geometry.rotation import quat_from_axis_angle, quat_rotate
-from flashdex.hands.spec import SIDES, HandSpec, Side
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import SIDES, Side
 
 NUM_WRIST, NUM_SLIDES = 6, 3
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flashdex.hands.spec import SIDES, HandSpec, Side
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import SIDES, Side
 from flashdex.motions.hand_spheres import make_spheres
 
 # share of its range at which a relaxed finger joint rests

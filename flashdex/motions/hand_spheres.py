@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flashdex.hands.spec import SIDES, HandSpec, Side
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import SIDES, Side
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -145,11 +144,6 @@ class MotionLibrary:
         """Visual mesh of an object, m, object frame."""
         file = self.path / self.manifest["objects"][object_row]["visual"]
         return trimesh.load_mesh(file, process=False)
-
-    def disk_bytes(self) -> int:
-        """Size on disk, bytes."""
-        files: Iterable[Path] = self.path.rglob("*")
-        return sum(f.stat().st_size for f in files if f.is_file())
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

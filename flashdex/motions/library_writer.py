@@ -16,6 +16,7 @@ import trimesh
 from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
+from flashdex.keys import FINGERS, SIDES
 from flashdex.motions.library import FRAME_KEYS, SCHEMA
 from flashdex.motions.objects import ObjectAsset
 
@@ -23,8 +24,8 @@ CONVENTIONS = {
     "units": {"length": "m", "angle": "rad", "time": "s", "mass": "kg"},
     "up": "z",
     "quat": "wxyz",
-    "hands": ["left", "right"],
-    "fingers": ["thumb", "index", "middle", "ring", "pinky"],
+    "hands": list(SIDES),
+    "fingers": list(FINGERS),
 }
 
 
@@ -123,9 +124,10 @@ class LibraryWriter:
             _write_meshes(work, name, asset)
             for name, asset in zip(names, self._objects.values(), strict=True)
         ]
-        self._stack_frames().memmap(work / "frames")
-        self._stack_motions().memmap(work / "motions")
-        _stack_objects(list(self._objects.values())).memmap(work / "objects")
+        self._stack_frames().memmap(str(work / "frames"))
+        self._stack_motions().memmap(str(work / "motions"))
+        objects = _stack_objects(list(self._objects.values()))
+        objects.memmap(str(work / "objects"))
         manifest = self._manifest | {
             "motions": [{"name": r.name, **r.info} for r in self._records],
             "objects": [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,17 @@ def _cluster(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
     merged.update_faces(merged.nondegenerate_faces() & merged.unique_faces())
     merged.remove_unreferenced_vertices()
     return merged
+
+
+def join_meshes(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh with the triangles of all parts; nothing is merged or cut.
+
+    Args:
+        parts: at least one mesh, in a common frame, m.
+    """
+    mesh = trimesh.util.concatenate(list(parts))
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
 
 
 def sample_surface_points(

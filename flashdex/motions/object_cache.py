@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from flashdex.files import open_atomic
 
 logger = logging.getLogger(__name__)
 
@@ -31,15 +31,8 @@ def write_cache(file: Path, values: Values) -> None:
     arrays["part_vertices"] = np.concatenate(values["parts"])
     arrays["part_sizes"] = np.array([len(p) for p in values["parts"]])
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                np.savez_compressed(stream, **arrays)
-            # Readers see the old file or the whole new one, never a part of it.
-            Path(temporary).replace(file)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+        with open_atomic(file) as stream:
+            np.savez_compressed(stream, **arrays)
     except OSError as error:
         logger.warning("%s: object not cached (%s)", file, error)
 

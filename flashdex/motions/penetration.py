@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from flashdex.hands.attach import add_hand
-from flashdex.hands.spec import SIDES, HandSpec, Side
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import SIDES, Side
 
 TABLE = "table"
 

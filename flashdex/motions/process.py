@@ -116,11 +116,13 @@ def _prepare(
     findings += late
     row |= figures
     vertices = [np.asarray(m.vertices) for m in aligned.meshes]
+    left, right = map(bool, aligned.active)
+    left_slot, right_slot = map(int, aligned.hand_object)
     return MotionRecord(
         name=demo.name,
         frames=make_frames(aligned, joint_pos, targets),
-        hand_active=tuple(bool(a) for a in aligned.active),
-        hand_object=tuple(int(s) for s in aligned.hand_object),
+        hand_active=(left, right),
+        hand_object=(left_slot, right_slot),
         objects=assets,
         support_disks=support_disks(aligned.poses, vertices, aligned.fps),
         info={

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.kinematics import HandKinematics
-from flashdex.hands.spec import HandSpec, Side
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import Side
 from flashdex.motions.hand_jacobian import HandJacobian
 from flashdex.motions.hand_model import HandModel
 from flashdex.motions.residuals import Residuals, RetargetWeights, Targets

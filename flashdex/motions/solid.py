@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from flashdex.geometry.sdf import SdfGrid
+from flashdex.motions.meshes import join_meshes
 from flashdex.motions.objects import ObjectAsset
 from flashdex.motions.signed_distance import surface_distance
 
@@ -50,7 +51,7 @@ def solid_values(asset: ObjectAsset) -> np.ndarray:
 
 def _compute(asset: ObjectAsset) -> np.ndarray:
     near = np.argwhere((asset.sdf > 0) & (asset.sdf < BULGE))
-    nodes = near * float(asset.sdf_spacing) + np.asarray(asset.sdf_origin, float)
+    nodes = near * float(asset.sdf_spacing) + np.asarray(asset.sdf_origin, np.float64)
     depth = np.full(len(nodes), np.inf)
     hulls = []
     for part in asset.parts:
@@ -58,7 +59,7 @@ def _compute(asset: ObjectAsset) -> np.ndarray:
         planes = nodes @ hull.equations[:, :3].T + hull.equations[:, 3]
         depth = np.minimum(depth, planes.max(axis=1))
         hulls.append(trimesh.Trimesh(hull.points, hull.simplices, process=False))
-    mesh = trimesh.util.concatenate(hulls)
+    mesh = join_meshes(hulls)
     outside = depth > 0
     step = float(asset.sdf_spacing)
     depth[outside] = surface_distance(mesh, nodes[outside], step=step)

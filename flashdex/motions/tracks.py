@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from flashdex.motions.demo import Side
+from flashdex.keys import Side
 
 # frames of the Gaussian that smooths velocities (method.md 14)
 VELOCITY_SIGMA = 2.0
@@ -100,11 +100,14 @@ def angular_velocity(
         fps: frames a second.
         sigma: of the Gaussian, frames; 0 for none.
     """
-    rot = rotation(quats)
     after = np.minimum(np.arange(len(quats)) + 1, len(quats) - 1)
     before = np.maximum(np.arange(len(quats)) - 1, 0)
     steps = (after - before)[:, None]
-    speed = (rot[after] * rot[before].inv()).as_rotvec() * fps / steps
+    speed = (
+        (rotation(quats[after]) * rotation(quats[before]).inv()).as_rotvec()
+        * fps
+        / steps
+    )
     return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
 
 

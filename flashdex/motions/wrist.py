@@ -8,8 +8,6 @@ import numpy as np
 
 from flashdex.motions.tracks import rotation
 
-LIMIT = 6.2  # rad, range of the wrist hinges
-
 
 def unwrap_wrist(quats: np.ndarray) -> np.ndarray:
     """Hinge angles with R = Rz(a) Rx(b) R-y(c), continuous over time.

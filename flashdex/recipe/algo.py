@@ -98,22 +98,16 @@ class AlgoConfig:
     """Exponent of the repetition lengths; larger repeats less."""
     compile: bool = False
     """Compile the updates (GPU); slow first minute, then faster."""
-    device: str = "auto"
-    """auto = GPU when there is one; or cpu, cuda, cuda:1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """The loop around the updates: evaluation, checkpoints, end."""
+    """The loop around the updates: checkpoints, logs, criterion, end."""
 
-    eval_every: int = number(20_000_000, low=1)
-    """Env steps between evaluations of every motion, besides the attempts."""
     checkpoint_every_s: float = number(300.0, above=0)
     """Seconds between checkpoints."""
     keep_checkpoints: int = number(3, low=1)
     """Newest checkpoints kept."""
-    checkpoint_buffer: bool = False
-    """Save the replay rows too; exact resume for a lot of disk."""
     log_every_s: float = number(5.0, above=0)
     """Seconds between log records."""
     wall_limit_s: float | None = number(None, above=0)

@@ -85,12 +85,6 @@ def _algo(recipe: Recipe) -> list[str]:
             f"algo.future_channels: expected three positive numbers, found "
             f"{algo.future_channels}"
         )
-    device = algo.device.split(":")[0]
-    if device not in ("auto", "cpu", "cuda"):
-        problems.append(
-            f"algo.device: '{algo.device}' is not allowed. Allowed: auto, cpu, cuda, "
-            f"cuda:N."
-        )
     return problems
 
 

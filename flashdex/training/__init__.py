@@ -1,0 +1,1 @@
+"""The run: setup, learner, loop, ledger of conversions, checkpoints, evaluation."""

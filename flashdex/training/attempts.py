@@ -112,7 +112,7 @@ class AttemptRecorder:
 
     def _finish(self, env: int, track: _Track, env_steps: int) -> Attempt:
         info = self.env.info
-        assert info is not None  # noqa: S101  a step has just been made
+        assert info is not None
         motion = int(info.motion[env])
         why = [
             {"cause": name, "hand": side}
@@ -123,9 +123,7 @@ class AttemptRecorder:
         rollout = self._rollout(env, track, motion, env_steps)
         return Attempt(rollout, motion, not why, why, int(info.frame[env]))
 
-    def _rollout(
-        self, env: int, track: _Track, motion: int, env_steps: int
-    ) -> Rollout:
+    def _rollout(self, env: int, track: _Track, motion: int, env_steps: int) -> Rollout:
         physics, bank = self.physics, self.env.bank
         scene = physics.scene(env)
         qpos, qvel = np.stack(track.qpos), np.stack(track.qvel)
@@ -168,10 +166,10 @@ class AttemptRecorder:
             qvel=qvel,
             object_pos=pose[..., :3],
             object_quat=pose[..., 3:],
-            ref_object_pos=ref["object_pos"].double().numpy(),
-            ref_object_quat=ref["object_quat"].double().numpy(),
-            fingertips=kin["tip_pos"].double().numpy(),
-            ref_fingertips=ref["tip_pos"].double().numpy(),
+            ref_object_pos=_float64(ref, "object_pos"),
+            ref_object_quat=_float64(ref, "object_quat"),
+            fingertips=_float64(kin, "tip_pos"),
+            ref_fingertips=_float64(ref, "tip_pos"),
             joints=joints,
             ref_joints=ref_joints,
             hand_active=bank.hand_active[motion].numpy(),
@@ -204,6 +202,10 @@ class AttemptRecorder:
             theirs.append(ref[:, i, order].double().numpy())
             bodies.append([hand.link_names[link] for link in links])
         return np.stack(ours, 1), np.stack(theirs, 1), bodies
+
+
+def _float64(td: TensorDictBase, key: str) -> np.ndarray:
+    return np.asarray(td[key], dtype=np.float64)
 
 
 def versions(engine: str = "cpu") -> dict[str, Any]:

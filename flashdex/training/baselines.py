@@ -12,8 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
+from flashdex.files import write_atomic
 from flashdex.metrics.criteria import score
-from flashdex.training.ledger import write_atomic
 from flashdex.training.rollouts import roll_all
 from flashdex.training.setup import Workbench
 
@@ -46,7 +46,8 @@ def hold_first_pose(env: TrackingEnv) -> Tensor:
 
 def follow_reference(env: TrackingEnv) -> Tensor:
     """``kinematic_playback``: the retargeted joints as position targets."""
-    return env.bank.at(env.motion, env.frame, ("joint_pos",))["joint_pos"]
+    ref = env.bank.at(env.motion, env.frame, ("joint_pos", "joint_vel"))
+    return env.leading_reference(ref)
 
 
 BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from flashdex.errors import RunError
+from flashdex.files import open_atomic
 
 FOLDER = "checkpoints"
 
@@ -22,14 +22,9 @@ def save_checkpoint(run_dir: Path, state: dict[str, Any], *, keep: int) -> Path:
         keep: newest checkpoints that stay.
     """
     folder = run_dir / FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{state['env_steps']:012d}.pt"
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
+    with open_atomic(path) as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
     for old in sorted(folder.glob("*.pt"))[:-keep]:
         old.unlink()
     return path

@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
+from flashdex.files import write_atomic
 from flashdex.metrics.aggregate import mean_object_errors, mope_more
 from flashdex.metrics.criteria import score
 from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.ledger import write_atomic
 from flashdex.training.rollouts import roll_all
 from flashdex.training.run import load_run_recipe
 from flashdex.training.setup import open_workbench
@@ -66,14 +66,18 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> Evaluation:
             {
                 "motion": attempt.rollout.motion,
                 **{name: verdicts[name].state for name in wanted},
-                "errors": {k: round(v, 5) for k, v in verdicts[criterion].values.items()},
+                "errors": {
+                    k: round(v, 5) for k, v in verdicts[criterion].values.items()
+                },
             }
         )
         errors.append((mean_object_errors(signals), verdicts["sr_spider_centred"]))
     totals: dict[str, Any] = {"env_steps": state["env_steps"], **mope_more(errors)}
     for name in dict.fromkeys([criterion, *SHOWN]):
         states = [row[name] for row in rows]
-        totals[name] = {s: states.count(s) for s in ("passed", "failed", "not_measured")}
+        totals[name] = {
+            s: states.count(s) for s in ("passed", "failed", "not_measured")
+        }
     text = json.dumps({"totals": totals, "motions": rows}, indent=1)
     write_atomic(run_dir / "evaluation.json", text)
     return Evaluation(rows, totals)

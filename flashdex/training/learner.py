@@ -26,6 +26,7 @@ from flashdex.recipe import AlgoConfig
 from flashdex.training.nstep import NStepAssembler
 from flashdex.training.rows import RowCodec
 
+
 class Learner:
     """Acts, remembers and learns; knows states and actions, but no simulator.
 
@@ -112,7 +113,7 @@ class Learner:
                 future.shape[1],
                 num_frames=future.shape[2],
                 latent_dim=c.future_latent,
-                widths=tuple(c.future_channels),
+                widths=c.future_channels,
                 ensemble=ensemble,
             )
 
@@ -215,7 +216,7 @@ class Learner:
         shown = assemble(self.sample_transforms, state)
         size = transition.batch_size[0]
         wanted = [keys.OBSERVATION, keys.GROUP_MASK]
-        if keys.FUTURE in shown.keys():
+        if shown.get(keys.FUTURE, None) is not None:
             wanted.append(keys.FUTURE)
         now, after = shown.select(*wanted).split(size)
         after = after.set(keys.TERMINATED, transition[keys.TERMINATED])

@@ -148,8 +148,7 @@ class Ledger:
         out: dict[str, Any] = {"rollout": f"{ROLLOUTS}/{path.name}"}
         if self.certify:
             certificate = certify(rollout)
-            text = json.dumps(certificate.to_dict(), indent=1)
-            write_atomic(path.with_suffix(".certificate.json"), text)
+            certificate.save(path.with_suffix(".certificate.json"))
             out["certified"] = certificate.verdict in ("certified", "robust")
             out["verdict"] = certificate.verdict
         return out
@@ -197,7 +196,12 @@ def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str
         return [dict(w) for w in attempt.why]
     if blame:
         return [
-            {"cause": b.term, "hand": b.side, "value": round(b.value, 5), "frame": b.frame}
+            {
+                "cause": b.term,
+                "hand": b.side,
+                "value": round(b.value, 5),
+                "frame": b.frame,
+            }
             for b in blame
         ]
     return [{"cause": reason}] if reason else []
@@ -231,10 +235,3 @@ def drop_cut_line(path: Path) -> None:
     if whole < len(content):
         with path.open("r+b") as file:
             file.truncate(whole)
-
-
-def write_atomic(path: Path, text: str) -> None:
-    """Write a text file so that a crash leaves the old one or the new one."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

@@ -104,7 +104,7 @@ class Trainer:
                 td.set(keys.action(side), action[:, i])
         with self.stats.time("env"):
             td = self.env.step(td)
-        after = td["next"]
+        after = td.get("next")
         self.env_steps += self.env.num_envs
         self._vector_steps += 1
         self._judge(action, after)
@@ -112,7 +112,7 @@ class Trainer:
             reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
             terminated, done = after[keys.TERMINATED], after[keys.DONE]
             self.learner.remember(td, action, reward, after, terminated, done)
-        assert self.env.info is not None  # noqa: S101  a step has just been made
+        assert self.env.info is not None
         self.stats.add_step(self.env.info.outcome, done, terminated)
         self._learn()
         self._assist_epoch()

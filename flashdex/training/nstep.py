@@ -108,7 +108,9 @@ def _select(mask: Tensor, new: TensorDict, old: TensorDict) -> TensorDict:
     out = {}
     for key in ("next_state", "terminated"):
         a, b = new[key], old[key]
-        out[key] = torch.where(keep, a, b) if isinstance(a, TensorDictBase) else (
-            torch.where(mask, a, b)
+        out[key] = (
+            torch.where(keep, a, b)
+            if isinstance(a, TensorDictBase)
+            else (torch.where(mask, a, b))
         )
     return TensorDict(out, batch_size=keep.shape)

@@ -40,13 +40,13 @@ class RowCodec:
         Returns:
             TensorDict (N,) of few wide leaves.
         """
-        state, after = row["state"], row["next_state"]
+        state, after = row.get("state"), row.get("next_state")
         packed = {
             "state": self._pack_state(state),
             "next_state": self._pack_state(after),
             "contact": state[keys.CONTACT].flatten(1),
             "next_contact": after[keys.CONTACT].flatten(1),
-            "action": row["action"].flatten(1).to(self.dtype),
+            "action": row.get("action").flatten(1).to(self.dtype),
             "reward": row["reward"],
             "flags": torch.cat([row["terminated"], row["steps"]], -1).to(torch.uint8),
             "index": torch.cat([state[keys.MOTION], state[keys.FRAME]], -1).int(),
@@ -121,6 +121,4 @@ class RowCodec:
 
 def row_bytes(packed: TensorDictBase) -> int:
     """Bytes of one packed row."""
-    return sum(
-        v[0].numel() * v.element_size() for v in packed.values(True, True)
-    )
+    return sum(v[0].numel() * v.element_size() for v in packed.values(True, True))

@@ -11,11 +11,12 @@ from typing import Any
 import torch
 
 from flashdex.errors import RunError
+from flashdex.files import write_atomic
 from flashdex.recipe import Recipe, dump_recipe, load_recipe
 from flashdex.training.attempts import versions
 from flashdex.training.baselines import score_baselines
 from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.ledger import Ledger, write_atomic
+from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
 from flashdex.training.setup import Workbench, open_workbench
@@ -43,8 +44,8 @@ def train(recipe: Recipe) -> Path:
     run_dir = default_run_dir(recipe)
     if (run_dir / RECIPE).exists():
         raise RunError(
-            f"{run_dir}: already holds a run. Continue it with 'flashdex train --resume "
-            f"{run_dir}', or choose another folder with run_dir=..."
+            f"{run_dir}: already holds a run. Continue it with 'flashdex train "
+            f"--resume {run_dir}', or choose another folder with run_dir=..."
         )
     bench = open_workbench(recipe)
     create_run_dir(run_dir, recipe)
@@ -93,8 +94,8 @@ def _git(*args: str) -> str:
     if not (root / ".git").exists():
         return ""
     try:
-        done = subprocess.run(  # noqa: S603
-            ["git", "-C", str(root), *args],  # noqa: S607
+        done = subprocess.run(
+            ["git", "-C", str(root), *args],
             capture_output=True,
             text=True,
             timeout=10,

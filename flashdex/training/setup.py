@@ -10,13 +10,17 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from flashdex import keys
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
-from flashdex.errors import FlashdexError, LibraryError, MissingExtraError
+from flashdex.errors import FlashdexError, LibraryError
+from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.prepare import prepare
@@ -37,7 +41,7 @@ class Workbench:
 
     recipe: Recipe
     library: MotionLibrary
-    hands: dict[str, HandSpec]
+    hands: dict[keys.Side, HandSpec]
     bank: ReferenceBank
 
     @property
@@ -62,8 +66,9 @@ class Workbench:
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
         if recipe.physics.engine != "cpu":
-            raise MissingExtraError(
-                f"physics engine '{recipe.physics.engine}'", extra=recipe.physics.engine
+            raise FlashdexError(
+                f"physics.engine: '{recipe.physics.engine}' is not part of this "
+                "version, which steps MuJoCo C on the CPU. Use physics=cpu."
             )
         physics = CpuPhysics(self.library, self.hands, recipe.physics, count)
         return TrackingEnv(
@@ -72,9 +77,18 @@ class Workbench:
             self.hands,
             recipe.env,
             step_dt=self.step_dt,
+            lead_s=self._wrist_lead() if recipe.env.wrist_lead else None,
             seed=recipe.seed if seed is None else seed,
             evaluation=evaluation,
         )
+
+    def _wrist_lead(self) -> Tensor:
+        """Lag of the wrist servos, s, (2, J); zero for the fingers."""
+        gains = self.recipe.physics.gains
+        lags = [servo_lag(self.hands[s].gains[gains]) for s in keys.SIDES]
+        lead = torch.tensor(np.stack(lags), dtype=torch.float32)
+        lead[:, NUM_WRIST_JOINTS:] = 0.0
+        return lead
 
     def make_learner(self, env: TrackingEnv) -> Learner:
         """Build networks, loss and replay for an environment's states."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flashdex.errors import UnknownNameError
+from flashdex.keys import SIDES
 from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
 from flashdex.viz.run_data import Line, RunData
 
-SIDES = ("left", "right")
 PROVEN = ("certified", "robust")
 # quantity -> (heading, unit, factor from m or rad)
 SHOWN = {

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from flashdex.errors import RunError
+from flashdex.files import write_atomic
 from flashdex.viz.curves import conversion_charts, learning_charts
 from flashdex.viz.facts import MotionFacts, count, motion_facts, num_motions
 from flashdex.viz.film import Film, draw_films
@@ -44,10 +44,8 @@ def write_report(run_dir: str | Path) -> Path:
     name = str(run.recipe.get("name", run.path.name))
     text = page(f"{name}: flashdex run", _sections(run, rows, stored, fault, name))
     path = run.path / REPORT
-    temporary = path.with_suffix(".tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        write_atomic(path, text)
     except OSError as error:
         raise RunError(f"{path}: cannot be written ({error.strerror}).") from error
     return path

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from flashdex.geometry import rotation as rot
 
@@ -54,25 +54,11 @@ def test_rotate_quarter_turn_golden():
     x, y, _ = torch.eye(3, dtype=torch.float64)
     close(rot.quat_rotate(about_z, x), y)
     close(rot.quat_rotate_inverse(about_z, y), x)
-    columns = torch.tensor([0, 1, 0, -1, 0, 0], dtype=torch.float64)
-    close(rot.quat_to_rot6d(about_z), columns)
 
 
-def test_matrix_matches_scipy_and_round_trips(quats):
+def test_matrix_matches_scipy(quats):
     q = quats[0]
-    matrix = rot.quat_to_matrix(q)
-    close(matrix, to_scipy(q).as_matrix())
-    back = rot.matrix_to_quat(matrix)
-    assert (back[:, 0] >= 0).all()
-    close((back * q).sum(-1).abs(), torch.ones(200, dtype=torch.float64))
-    close(rot.matrix_to_rot6d(matrix), matrix.mT[:, :2].flatten(1))
-
-
-@pytest.mark.parametrize("axis", torch.eye(3, dtype=torch.float64), ids="xyz")
-def test_matrix_to_quat_at_half_turns(axis):
-    q = torch.cat((axis.new_zeros(1), axis))
-    back = rot.matrix_to_quat(rot.quat_to_matrix(q))
-    close((back * q).sum().abs(), torch.tensor(1.0, dtype=torch.float64))
+    close(rot.quat_to_matrix(q), to_scipy(q).as_matrix())
 
 
 def test_tiny_angle_keeps_its_digits():
@@ -92,10 +78,6 @@ def test_half_turn_is_finite():
     vector = rot.quat_to_rotvec(q)
     assert torch.isfinite(vector).all()
     close(vector.norm(), torch.tensor(math.pi, dtype=torch.float64))
-    half = rot.quat_slerp(IDENTITY, q, 0.5)
-    close(
-        rot.quat_angle(half, IDENTITY), torch.tensor(math.pi / 2, dtype=torch.float64)
-    )
 
 
 def test_both_signs_are_one_rotation(quats, vectors):
@@ -120,28 +102,11 @@ def test_gradients_are_finite_at_identity():
     close(vector.grad, torch.ones(3, dtype=torch.float64))
 
 
-def test_slerp_matches_scipy_and_takes_the_short_way(quats):
-    a, b, _ = quats
-    share = torch.linspace(0, 1, 200, dtype=torch.float64)
-    got = rot.quat_slerp(a, b, share)
-    for i in range(0, 200, 20):
-        ends = Rotation.concatenate([to_scipy(a[i]), to_scipy(b[i])])
-        want = Slerp([0, 1], ends)(share[i].item())
-        assert (to_scipy(got[i]).inv() * want).magnitude() < 1e-7
-    close(rot.quat_angle(a, got), share * rot.quat_angle(a, b))
-    close(rot.quat_slerp(a, b, 0.0), a)
-    close(
-        rot.quat_angle(rot.quat_slerp(a, -b, 0.3), rot.quat_slerp(a, b, 0.3)), 0 * share
-    )
-
-
-def test_transform_points_and_back(quats, vectors):
+def test_transform_points_matches_the_matrix(quats, vectors):
     pos, quat = vectors[:5], quats[0, :5]
     points = vectors.view(5, 40, 3)
-    world = rot.transform_points(pos, quat, points)
-    want = rot.quat_rotate(quat[:, None], points) + pos[:, None]
-    close(world, want)
-    close(rot.inverse_transform_points(pos, quat, world), points)
+    turned = np.einsum("bij,bpj->bpi", to_scipy(quat).as_matrix(), points.numpy())
+    close(rot.transform_points(pos, quat, points), turned + pos[:, None].numpy())
 
 
 def test_leading_axes_broadcast_and_dtype_stays():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flashdex.hands.attach import add_hand
-from flashdex.hands.spec import FINGERS, SIDES
+from flashdex.keys import FINGERS, SIDES
 
 
 @pytest.fixture

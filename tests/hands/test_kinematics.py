@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from flashdex.hands.kinematics import HandKinematics
-from flashdex.hands.spec import FINGERS, SIDES, load_hand
+from flashdex.hands.spec import load_hand
+from flashdex.keys import FINGERS, SIDES
 
 
 def test_kinematics_match_mujoco(make_model, sample_qpos, sites):

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.errors import UnknownHandError
 from flashdex.hands.attach import add_hand
-from flashdex.hands.spec import SIDES, HandError, load_hand
+from flashdex.hands.spec import HandError, load_hand
+from flashdex.keys import SIDES
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("FLASHDEX_SHARED", ROOT.parent / "shared"))

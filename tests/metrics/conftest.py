@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from flashdex.keys import FINGERS
 from flashdex.metrics.rollout import Rollout
 from flashdex.metrics.signals import compute_signals
 
-FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 FRAMES, DECIMATION = 90, 4
 
 

@@ -1,12 +1,9 @@
-"""Rates, MOPE and MORE, and the book of first conversions."""
-
-import json
+"""Rates, MOPE and MORE."""
 
 import pytest
 import torch
 
 from flashdex.metrics.aggregate import Rate, mean_object_errors, mope_more, rates
-from flashdex.metrics.conversions import ConversionBook
 from flashdex.metrics.criteria import score
 
 T = 60
@@ -51,48 +48,3 @@ def test_mope_is_over_spider_passes_and_mope_all_over_everything(poses):
 
 def test_errors_that_are_not_numbers_do_not_enter_means(poses):
     assert mean_object_errors(poses(constant(float("nan")))) is None
-
-
-def test_a_conversion_stays_and_the_latest_evaluation_forgets():
-    book = ConversionBook(num_accepted=4, num_offered=5)
-    assert book.record("a", "failed", env_steps=5, gpu_hours=0.1) is False
-    assert book.record("a", "passed", env_steps=10, gpu_hours=0.5) is True
-    book.record("b", "passed", env_steps=10, gpu_hours=0.5)
-    assert book.record("a", "failed", env_steps=20, gpu_hours=1.0) is False
-    metrics = book.metrics()
-    assert metrics["convert/cumulative"] == 2
-    assert metrics["convert/rate"] == 0.5
-    assert metrics["convert/rate_all"] == 0.4
-    assert metrics["convert/last"] == 0.5
-    assert metrics["convert/per_gpu_hour"] == 2.0
-    assert (book.first["a"].env_steps, book.first["a"].attempt) == (10, 2)
-
-
-def test_second_pass_does_not_move_the_first():
-    book = ConversionBook(num_accepted=1, num_offered=1)
-    book.record("a", "passed", env_steps=10, gpu_hours=0.5)
-    assert book.record("a", "passed", env_steps=20, gpu_hours=1.0) is False
-    assert book.first["a"].env_steps == 10
-
-
-def test_certificates_are_counted_beside_conversions():
-    book = ConversionBook(num_accepted=4, num_offered=4)
-    for motion in "abcd":
-        book.record(motion, "passed", env_steps=1, gpu_hours=0.1)
-    book.record_certificate("a", "robust")
-    book.record_certificate("a", "failed")  # a worse second rollout changes nothing
-    book.record_certificate("b", "certified")
-    book.record_certificate("c", "failed")
-    metrics = book.metrics()
-    assert metrics["convert/certified"] == 2
-    assert metrics["convert/robust"] == 1
-    assert metrics["convert/uncertified"] == 1
-
-
-def test_book_survives_a_checkpoint():
-    book = ConversionBook(num_accepted=2, num_offered=3)
-    book.record("a", "passed", env_steps=10, gpu_hours=0.5)
-    book.record_certificate("a", "robust")
-    again = ConversionBook.from_state_dict(json.loads(json.dumps(book.state_dict())))
-    assert again == book
-    assert again.record("a", "passed", env_steps=20, gpu_hours=1.0) is False

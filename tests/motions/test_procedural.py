@@ -3,8 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flashdex.errors import UnknownSourceError
+from flashdex.keys import SIDES
 from flashdex.motions.contacts import tip_distances
-from flashdex.motions.demo import SIDES
 from flashdex.motions.sources.human_hand import (
     LOWER,
     PHALANGES,

@@ -5,7 +5,8 @@ import torch
 
 from flashdex.hands.attach import add_hand
 from flashdex.hands.kinematics import HandKinematics
-from flashdex.hands.spec import SIDES, load_hand
+from flashdex.hands.spec import load_hand
+from flashdex.keys import SIDES
 from flashdex.motions.align import align
 from flashdex.motions.hand_jacobian import HandJacobian
 from flashdex.motions.hand_spheres import make_spheres

@@ -42,6 +42,26 @@ def make_bench(library, hands, bank):
     return make
 
 
+@pytest.fixture(scope="module")
+def roll_tiny(library, hands, bank):
+    """Roll every motion of the synthetic library under a controller."""
+    from flashdex.training.rollouts import roll_all
+    from flashdex.training.setup import Workbench
+
+    recipe = Recipe(
+        name="tiny",
+        total_env_steps=1,
+        env=EnvConfig(num_envs=3, finger_mode="residual"),
+        physics=PhysicsConfig(num_threads=1),
+    )
+    bench = Workbench(recipe, library, hands, bank)
+
+    def roll(controller):
+        return roll_all(bench, controller, criterion="sr_mt_obj")
+
+    return roll
+
+
 @pytest.fixture
 def collect():
     """Act, step and remember for a number of vector steps; return the last root."""

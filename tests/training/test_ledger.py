@@ -11,8 +11,7 @@ import torch
 
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.rollout import Rollout
-from flashdex.training.ledger import CONVERSIONS, Ledger, read_lines, write_atomic
-from flashdex.training.rollouts import roll_all
+from flashdex.training.ledger import CONVERSIONS, Ledger, read_lines
 
 REQUIRED = {
     "motion": str,
@@ -30,23 +29,13 @@ REQUIRED = {
 
 
 @pytest.fixture(scope="module")
-def attempts(library, hands, bank):
+def attempts(roll_tiny):
     """Zero residual actions: three attempts of full length."""
-    from flashdex.recipe import EnvConfig, PhysicsConfig, Recipe
-    from flashdex.training.setup import Workbench
-
-    recipe = Recipe(
-        name="tiny",
-        total_env_steps=1,
-        env=EnvConfig(num_envs=3, finger_mode="residual"),
-        physics=PhysicsConfig(num_threads=1),
-    )
-    bench = Workbench(recipe, library, hands, bank)
 
     def idle(td, env):
         return torch.zeros(env.num_envs, 2, 18)
 
-    return roll_all(bench, idle, criterion="sr_mt_obj")
+    return roll_tiny(idle)
 
 
 @pytest.fixture
@@ -169,10 +158,3 @@ def test_a_broken_line_in_the_middle_is_an_error(tmp_path):
     path.write_text('{"a": 1}\n{"b":\n{"c": 2}\n')
     with pytest.raises(ValueError, match="Expecting"):
         read_lines(path)
-
-
-def test_atomic_writes_leave_no_temporary_file(tmp_path):
-    for text in ("one", "two"):
-        write_atomic(tmp_path / "a.json", text)
-        assert (tmp_path / "a.json").read_text() == text
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]

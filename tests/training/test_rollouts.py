@@ -12,7 +12,6 @@ from flashdex.metrics.criteria import score
 from flashdex.metrics.resimulation import load_scene, resimulate
 from flashdex.metrics.rollout import Rollout
 from flashdex.training.attempts import AttemptRecorder
-from flashdex.training.rollouts import roll_all
 
 
 def shaky(scale, seed=0):
@@ -26,18 +25,8 @@ def shaky(scale, seed=0):
 
 
 @pytest.fixture(scope="module")
-def attempts(library, hands, bank):
-    from flashdex.recipe import EnvConfig, PhysicsConfig, Recipe
-    from flashdex.training.setup import Workbench
-
-    recipe = Recipe(
-        name="tiny",
-        total_env_steps=1,
-        env=EnvConfig(num_envs=3, finger_mode="residual"),
-        physics=PhysicsConfig(num_threads=1),
-    )
-    bench = Workbench(recipe, library, hands, bank)
-    return roll_all(bench, shaky(0.7), criterion="sr_mt_obj")
+def attempts(roll_tiny):
+    return roll_tiny(shaky(0.7))
 
 
 def test_one_full_length_attempt_a_motion(attempts, library):

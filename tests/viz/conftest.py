@@ -10,12 +10,12 @@ import pytest
 import yaml
 
 from flashdex.cli import main
+from flashdex.keys import FINGERS
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.rollout import Rollout
 
 FRAMES, DECIMATION = 36, 4
 EVIL = '<script>alert("x")</script> & co'
-FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 SITES = "".join(f'<site name="left_pad_{f}" pos=".02 0 0"/>' for f in FINGERS)
 SCENE = f"""
 <mujoco>

@@ -1,0 +1,1 @@
+"""Physics engines behind one protocol: state in, control step, state out."""

@@ -44,7 +44,7 @@ class CpuPhysics:
     def __init__(
         self,
         library: MotionLibrary,
-        hands: dict[str, HandSpec],
+        hands: dict[keys.Side, HandSpec],
         physics: PhysicsConfig,
         num_envs: int,
     ) -> None:

@@ -1,0 +1,1 @@
+"""Observation transforms: from the compact state to what a policy sees."""

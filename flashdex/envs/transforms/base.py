@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
@@ -40,17 +39,19 @@ class StateTransform(Transform):
         """Assemble a policy input, or both ends of a replay sample."""
         self._call(tensordict)
         after = tensordict.get("next", None)
-        if after is not None and keys.JOINT_POS in after.keys():
+        if after is not None and after.get(keys.JOINT_POS, None) is not None:
             self._call(after)
         return tensordict
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> Composite:
         """Declare ``out_keys`` by running ``assemble`` on a zero state."""
+        if not isinstance(observation_spec, Composite):
+            msg = "the compact state is a Composite of its entries"
+            raise TypeError(msg)
         zeros = observation_spec.zero()
         for key, value in self.assemble(zeros).items():
-            dtype = torch.bool if value.dtype == torch.bool else value.dtype
             observation_spec[key] = Unbounded(
-                shape=value.shape, dtype=dtype, device=observation_spec.device
+                shape=value.shape, dtype=value.dtype, device=observation_spec.device
             )
         return observation_spec
 

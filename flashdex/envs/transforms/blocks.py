@@ -34,8 +34,10 @@ class ReferenceDelta(Block):
         hands: specs of both sides, for the mapped links.
     """
 
+    links: Tensor  # (2, Q)
+
     def __init__(
-        self, name: str, used_hands: list[int], hands: dict[str, HandSpec]
+        self, name: str, used_hands: list[int], hands: dict[keys.Side, HandSpec]
     ) -> None:
         super().__init__(name, used_hands)
         links = [[link for link, _ in hands[s].keypoint_links] for s in keys.SIDES]
@@ -43,9 +45,9 @@ class ReferenceDelta(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``features.reference_delta``."""
-        own = td["own"]
+        pos, quat = _own(td, "pos", "quat")
         return features.reference_delta(
-            td[keys.KIN], td[keys.REF], own["pos"], own["quat"], self.links
+            td[keys.KIN], td[keys.REF], pos, quat, self.links
         )
 
 
@@ -56,8 +58,7 @@ class ObjectState(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``features.object_state``."""
-        own = td["own"]
-        return features.object_state(td[keys.KIN], own["pos"], own["quat"], own["vel"])
+        return features.object_state(td[keys.KIN], *_own(td, "pos", "quat", "vel"))
 
 
 class ObjectPoints(Block):
@@ -70,6 +71,7 @@ class ObjectPoints(Block):
     """
 
     needs_object = True
+    points: Tensor  # object frame, m, (Q, P, 3)
 
     def __init__(self, name: str, bank: ReferenceBank, *, num_points: int) -> None:
         super().__init__(name, bank.used_hands)
@@ -77,10 +79,9 @@ class ObjectPoints(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``features.object_points``."""
-        own = td["own"]
-        points = self.points[own["row"]]
+        pos, quat, row = _own(td, "pos", "quat", "row")
         return features.object_points(
-            td[keys.KIN], td[keys.REF], own["pos"], own["quat"], points
+            td[keys.KIN], td[keys.REF], pos, quat, self.points[row]
         )
 
 
@@ -94,9 +95,10 @@ class SurfaceDistance(Block):
     """
 
     needs_object = True
+    tip_radius: Tensor  # m, (2, 5)
 
     def __init__(
-        self, name: str, bank: ReferenceBank, hands: dict[str, HandSpec]
+        self, name: str, bank: ReferenceBank, hands: dict[keys.Side, HandSpec]
     ) -> None:
         super().__init__(name, bank.used_hands)
         self.sdf = bank.sdf
@@ -105,9 +107,9 @@ class SurfaceDistance(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``features.fingertip_distance``."""
-        own = td["own"]
+        pos, quat, row = _own(td, "pos", "quat", "row")
         distance, normal = features.fingertip_distance(
-            td[keys.KIN], own["pos"], own["quat"], own["row"], self.sdf, self.tip_radius
+            td[keys.KIN], pos, quat, row, self.sdf, self.tip_radius
         )
         return torch.cat([distance, normal.flatten(-2)], -1)
 
@@ -135,7 +137,7 @@ class FutureWindow(StateTransform):
         self, bank: ReferenceBank, *, horizon: int, reference_offset: int
     ) -> None:
         super().__init__(
-            in_keys=[keys.KIN, "own", keys.GROUP_MASK, keys.MOTION, keys.FRAME],
+            in_keys=[keys.KIN, keys.OWN, keys.GROUP_MASK, keys.MOTION, keys.FRAME],
             out_keys=[keys.FUTURE],
         )
         self.bank = bank
@@ -147,11 +149,14 @@ class FutureWindow(StateTransform):
         motion = td[keys.MOTION].squeeze(-1)
         frame = td[keys.FRAME].squeeze(-1) + self.reference_offset
         vectors, rotations = self.bank.window(motion, frame, self.horizon)
-        own = td["own"]
         values = features.future_window(
-            td[keys.KIN], vectors, rotations, own["pos"], own["quat"], own["vel"]
+            td[keys.KIN], vectors, rotations, *_own(td, "pos", "quat", "vel")
         )
         mask = td[keys.GROUP_MASK][..., None, None]
         values = torch.where(mask, values, torch.zeros_like(values))
         values = torch.nan_to_num(values).clamp(-100.0, 100.0)
         return {keys.FUTURE: values[:, self.bank.used_hands].flatten(1, 2)}
+
+
+def _own(td: TensorDictBase, *names: str) -> list[Tensor]:
+    return [td[keys.OWN, name] for name in names]

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchrl.envs.transforms import Transform
 
+from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms import blocks
 from flashdex.envs.transforms.context import ConcatBlocks, TrackingContext
@@ -18,7 +19,7 @@ from flashdex.recipe.options import build_options
 def make_transforms(
     mapping: Mapping[str, Mapping[str, Any] | None],
     bank: ReferenceBank,
-    hands: dict[str, HandSpec],
+    hands: dict[keys.Side, HandSpec],
     *,
     reference_offset: int,
 ) -> list[Transform]:
@@ -40,8 +41,7 @@ def make_transforms(
         TrackingContext(bank, kinematics, reference_offset=reference_offset)
     ]
     names = [name for name in options if name != "future_window"]
-    for name in names:
-        out.append(_make_block(name, options[name], bank, hands))
+    out += [_make_block(name, options[name], bank, hands) for name in names]
     if "future_window" in options:
         horizon = options["future_window"].horizon
         window = blocks.FutureWindow(
@@ -53,7 +53,7 @@ def make_transforms(
 
 
 def _make_block(
-    name: str, options: Any, bank: ReferenceBank, hands: dict[str, HandSpec]
+    name: str, options: Any, bank: ReferenceBank, hands: dict[keys.Side, HandSpec]
 ) -> Transform:
     match name:
         case "proprioception":

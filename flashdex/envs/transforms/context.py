@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Composite, TensorSpec
 
 from flashdex import keys
 from flashdex.envs.features import gather_own
@@ -48,8 +49,10 @@ class TrackingContext(StateTransform):
     def __init__(
         self, bank: ReferenceBank, kinematics: HandKinematics, *, reference_offset: int
     ) -> None:
-        out = [(keys.KIN, f) for f in _KIN_FIELDS] + [(keys.REF, f) for f in _REF_FIELDS]
-        own = [("own", name) for name in ("pos", "quat", "vel", "row", "present")]
+        out = [(keys.KIN, f) for f in _KIN_FIELDS] + [
+            (keys.REF, f) for f in _REF_FIELDS
+        ]
+        own = [(keys.OWN, name) for name in ("pos", "quat", "vel", "row", "present")]
         state = [keys.JOINT_POS, keys.JOINT_VEL, keys.OBJECT_POSE, keys.OBJECT_VEL]
         super().__init__(
             in_keys=[*state, keys.MOTION, keys.FRAME],
@@ -70,11 +73,11 @@ class TrackingContext(StateTransform):
         present = self.bank.has_object[motion].unsqueeze(-1)
         out: dict[NestedKey, Tensor] = {(keys.KIN, f): kin[f] for f in _KIN_FIELDS}
         out.update({(keys.REF, f): ref[f] for f in _REF_FIELDS})
-        out["own", "pos"] = pose[..., :3]
-        out["own", "quat"] = pose[..., 3:]
-        out["own", "vel"] = gather_own(td[keys.OBJECT_VEL], slot)
-        out["own", "row"] = self.bank.hand_object[motion]
-        out["own", "present"] = present
+        out[keys.OWN, "pos"] = pose[..., :3]
+        out[keys.OWN, "quat"] = pose[..., 3:]
+        out[keys.OWN, "vel"] = gather_own(td[keys.OBJECT_VEL], slot)
+        out[keys.OWN, "row"] = self.bank.hand_object[motion]
+        out[keys.OWN, "present"] = present
         out[keys.GROUP_MASK] = self.bank.hand_active[motion]
         return out
 
@@ -95,7 +98,7 @@ class Block(StateTransform):
 
     def __init__(self, name: str, used_hands: list[int]) -> None:
         super().__init__(
-            in_keys=[keys.KIN, keys.REF, "own", keys.GROUP_MASK],
+            in_keys=[keys.KIN, keys.REF, keys.OWN, keys.GROUP_MASK],
             out_keys=[(keys.BLOCKS, name)],
         )
         self.name, self.used_hands = name, used_hands
@@ -109,7 +112,7 @@ class Block(StateTransform):
         values = self.features(td)
         mask = td[keys.GROUP_MASK].unsqueeze(-1)
         if self.needs_object:
-            mask = mask & td["own", "present"]
+            mask = mask & td[keys.OWN, "present"]
         values = torch.where(mask, values, torch.zeros_like(values))
         return {(keys.BLOCKS, self.name): values[:, self.used_hands].flatten(1)}
 
@@ -137,12 +140,11 @@ class ConcatBlocks(StateTransform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         td = super()._call(next_tensordict)
-        return td.exclude(keys.KIN, keys.REF, "own", keys.BLOCKS, inplace=True)
+        return td.exclude(keys.KIN, keys.REF, keys.OWN, keys.BLOCKS, inplace=True)
 
-    def transform_observation_spec(self, observation_spec):  # noqa: ANN001, ANN201
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> Composite:
         """Declare the observation and forget the intermediates."""
         spec = super().transform_observation_spec(observation_spec)
-        for key in (keys.KIN, keys.REF, "own", keys.BLOCKS):
-            if key in spec.keys():
-                del spec[key]
+        for key in {keys.KIN, keys.REF, keys.OWN, keys.BLOCKS} & set(spec.keys()):
+            del spec[key]
         return spec

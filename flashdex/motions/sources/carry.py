@@ -156,7 +156,7 @@ def grasp_target(shape: Shape, rng: np.random.Generator) -> GraspTarget:
         lateral = FINGER_PITCH * (i - (shape.fingers - 1) / 2)
         tips[i + 1] = _touch(shape, centre + lateral * y, across) + gap * across
     mesh = shape.mesh
-    surface, faces = trimesh.sample.sample_surface(mesh, 1500, seed=0)
+    surface, faces, *_ = trimesh.sample.sample_surface(mesh, 1500, seed=0)
     normals = np.asarray(mesh.face_normals)[faces]
     palm = np.stack([x, y, z], axis=-1)
     return GraspTarget(tips, palm, np.asarray(surface), normals, floor)

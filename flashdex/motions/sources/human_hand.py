@@ -38,7 +38,6 @@ FINGER_RADIUS = 0.009
 
 # angles: 4 x (MCP flexion, MCP abduction, PIP flexion), then thumb (opposition,
 # extension from the palm's x axis, MCP flexion, IP flexion); radians
-NUM_ANGLES = 16
 OPEN = np.array([0.25, 0.0, 0.25] * 4 + [1.1, 1.0, 0.1, 0.1])
 GRASP = np.array([0.75, 0.0, 0.65] * 4 + [1.45, 0.75, 0.25, 0.35])
 LOWER = np.array([-0.2, -0.25, 0.0] * 4 + [0.2, 0.2, -0.1, -0.2])

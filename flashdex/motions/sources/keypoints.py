@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.motions.demo import SIDES, DemoObject, HumanDemo, Side
-from flashdex.motions.meshes import load_mesh
+from flashdex.keys import SIDES, Side
+from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
 
@@ -62,11 +62,13 @@ def read_file(file: Path) -> HumanDemo:
             f"{file}: not a readable .npz without pickles: {error}"
         ) from error
     missing = [key for key in REQUIRED if key not in data]
-    hands = [side for side in SIDES if f"kp_{side}" in data]
+    hands: list[Side] = [side for side in SIDES if f"kp_{side}" in data]
     if missing or not hands:
         lack = missing + ([] if hands else ["kp_left or kp_right"])
         raise DemoError(f"{file}: lacks {', '.join(lack)}. Found: {', '.join(data)}.")
-    keypoints = {s: data[f"kp_{s}"].astype(np.float64) for s in hands}
+    keypoints: dict[Side, np.ndarray] = {
+        s: data[f"kp_{s}"].astype(np.float64) for s in hands
+    }
     name = str(data["object"])
     licence = file.parent / "LICENSE"
     return HumanDemo(
@@ -128,7 +130,7 @@ def _support(demo: HumanDemo) -> float | None:
         demo.validate()
     except DemoError:
         return None  # each piece is validated on its own; some may be sound
-    vertices = [np.asarray(load_mesh(Path(b.mesh)).vertices) for b in demo.objects]
+    vertices = [np.asarray(b.load_mesh().vertices) for b in demo.objects]
     poses = [b.pose for b in demo.objects]
     height, found = estimate_support(poses, vertices, demo.fps)
     return height if found else None

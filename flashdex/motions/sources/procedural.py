@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import trimesh
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from flashdex.errors import UnknownSourceError
-from flashdex.motions.demo import SIDES, DemoObject, HumanDemo, Side
+from flashdex.keys import SIDES, Side
+from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.sources.carry import CarryPlan, Track, carry_track
 from flashdex.motions.sources.shapes import SHAPES
 from flashdex.motions.tracks import continuous, palm_frame, to_quat
@@ -104,7 +106,7 @@ def procedural(
 
 def _make(kind: Kind, name: str, rng: np.random.Generator) -> HumanDemo:
     tracks: dict[Side, Track] = {}
-    bodies = {}
+    bodies: dict[Side, tuple[str, trimesh.Trimesh]] = {}
     for side, shape_name in kind.shapes.items():
         shape = SHAPES[shape_name](rng)
         plan = _plan(kind, rng)

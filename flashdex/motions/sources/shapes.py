@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 import trimesh
 
+from flashdex.motions.meshes import join_meshes
+
 Approach = Literal["top", "side"]
 
 
@@ -100,7 +102,7 @@ def spoon(rng: np.random.Generator) -> Shape:
     stick.apply_transform(turn(np.pi / 2, X_AXIS))
     # both ends on the table: the handle falls by (0.8 bulb - handle) over its length
     tilt = np.arcsin((0.8 * bulb - handle) / length)
-    mesh = trimesh.util.concatenate([stick, head])
+    mesh = join_meshes([stick, head])
     mesh.apply_transform(turn(-tilt, X_AXIS))
     mesh = _centred(mesh)
     hits, _, _ = mesh.ray.intersects_location([[0, 0, 1.0]], [[0, 0, -1.0]])

@@ -1,0 +1,151 @@
+"""Write docs/options.md: every option of a recipe, from the schema's own docstrings."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import sys
+import textwrap
+import typing
+from pathlib import Path
+from typing import Any
+
+from flashdex.envs.transforms import blocks
+from flashdex.recipe import EnvConfig, Recipe
+from flashdex.recipe.options import REGISTRY, NoOptions
+from flashdex.recipe.schema import Expectation
+
+PAGE = Path(__file__).parent / "options.md"
+HEAD = """# Every option
+
+Made by `python docs/make_options.py` from the dataclasses in `flashdex/recipe/`, which
+are the one place of defaults; a test fails when this page is not up to date. How a
+recipe is put together stands on the page [recipes](recipes.md).
+
+Metres, radians, seconds, kilograms, unless a unit is given.
+"""
+NAMED_NOTES = {
+    "transforms": "Observation blocks by name. `null` takes one out of a recipe,\n"
+    "`~env.transforms.NAME` does so on the command line.",
+    "rewards": "Reward terms by name. A hand receives half of a weight, except of\n"
+    "`failure`; every term is multiplied by the control step in seconds.",
+    "terminations": "What ends an episode by failure, by name.",
+}
+
+
+def plain(text: str) -> str:
+    """Return a docstring as one line of Markdown."""
+    return " ".join(text.split()).replace("<", "&lt;")
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """Return the docstring below each field of a dataclass, in one line each."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for field, text in zip(tree.body, tree.body[1:], strict=False):
+        is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+        if isinstance(field, ast.AnnAssign) and is_text:
+            name = ast.unparse(field.target)
+            found[name] = plain(str(ast.literal_eval(text.value)))
+    return found
+
+
+def allowed(field: dataclasses.Field[Any], hint: Any) -> str:
+    """Say what a field accepts: its type or choices, and its range."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return ", ".join(f"`{a}`" for a in args)
+    if origin is list:
+        return f"list of {allowed(field, args[0])}"
+    inner = [a for a in args if a is not type(None)]
+    if len(inner) < len(args):
+        return f"{allowed(field, inner[0])} or null"
+    names = {int: "integer", float: "number", bool: "true or false", str: "text"}
+    bounds = [
+        f"{sign} {field.metadata[key]:g}"
+        for key, sign in (("above", "&gt;"), ("low", "&ge;"), ("high", "&le;"))
+        if field.metadata.get(key) is not None
+    ]
+    return " ".join([names.get(hint, str(hint)), " and ".join(bounds)]).strip()
+
+
+def default(field: dataclasses.Field[Any]) -> str:
+    """Return a field's default as YAML writes it."""
+    if field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    elif field.default is dataclasses.MISSING:
+        return "must be given"
+    else:
+        value = field.default
+    if value is None or isinstance(value, bool):
+        return f"`{str(value).lower() if value is not None else 'null'}`"
+    if isinstance(value, int):
+        return f"`{value:_}`"
+    is_periodic = isinstance(value, float) and len(repr(value)) > 8
+    return f"`1/{1 / value:.0f}`" if is_periodic else f"`{value}`"
+
+
+def table(cls: type) -> list[str]:
+    """Return the table of one dataclass, without what has a section of its own."""
+    docs, hints = field_docs(cls), typing.get_type_hints(cls)
+    lines = ["| key | default | allowed | meaning |", "| --- | --- | --- | --- |"]
+    for field in dataclasses.fields(cls):
+        if not has_own_section(cls, field.name, hints[field.name]):
+            cells = (default(field), allowed(field, hints[field.name]))
+            lines.append(
+                f"| `{field.name}` | {cells[0]} | {cells[1]} | {docs[field.name]} |"
+            )
+    return lines if len(lines) > 2 else ["No options."]
+
+
+def has_own_section(cls: type, name: str, hint: Any) -> bool:
+    """Whether a field is a group of options."""
+    kinds = [hint, *typing.get_args(hint)]
+    is_group = any(dataclasses.is_dataclass(kind) for kind in kinds)
+    return is_group or (cls is EnvConfig and name in REGISTRY)
+
+
+def section(path: str, cls: type, *, about: str = "") -> list[str]:
+    """Return heading, description and table of one group of options, and its groups."""
+    text = about or inspect.cleandoc(cls.__doc__ or "")
+    intro = [plain(p) for p in text.split("\n\n") if not p.startswith("Example")]
+    lines = ["## " + (path or "The recipe"), ""]
+    for part in intro:
+        lines += [part, ""]
+    lines += [*table(cls), ""]
+    for name, hint in typing.get_type_hints(cls).items():
+        where = f"{path}.{name}" if path else name
+        for kind in (hint, *typing.get_args(hint)):
+            if dataclasses.is_dataclass(kind) and kind is not Expectation:
+                lines += section(where, typing.cast(type, kind))
+        if cls is EnvConfig and name in REGISTRY:
+            lines += named_section(where, name)
+    return lines
+
+
+def named_section(path: str, kind: str) -> list[str]:
+    """Return one subsection for each registered part of a kind."""
+    lines = [f"## {path}", "", NAMED_NOTES[kind], ""]
+    for name, cls in REGISTRY[typing.cast(Any, kind)].items():
+        about = ""
+        if cls is NoOptions:
+            block = getattr(blocks, name.title().replace("_", ""))
+            about = inspect.cleandoc(block.__doc__).split("\n\n")[0]
+        part = section(f"{path}.{name}", cls, about=about)
+        lines += ["#" + part[0], *part[1:]]
+    return lines
+
+
+def render() -> str:
+    """Return the whole page."""
+    expect = ["## expect", "", "A list; each entry promises one number.", ""]
+    lines = [*section("", Recipe), *expect, *table(Expectation)]
+    return HEAD + "\n" + "\n".join(lines).rstrip() + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(render(), encoding="utf-8")
+    print(f"{PAGE.name} written")
+    sys.exit(0)

@@ -1,0 +1,210 @@
+"""The pages say what is true: options, logged keys, verbs, files, criteria, columns."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from flashdex.cli import make_parser
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+CELL = re.compile(r"^\| `([^`]+)`", re.MULTILINE)
+# Small enough for seconds, with every part that logs something switched on.
+SIZES = {
+    "batch_size": 16,
+    "buffer_size": 400,
+    "min_buffer": 40,
+    "n_step": 2,
+    "actor_width": 16,
+    "critic_width": 16,
+    "num_atoms": 11,
+    "future_latent": 8,
+    "future_channels": [8, 8, 8],
+}
+
+
+def load_script(name):
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def section(page, heading):
+    """Text below one heading of a page, up to the next of the same level."""
+    text = (DOCS / page).read_text()
+    found = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE)
+    assert found, f"{page} has no heading '{heading}'"
+    rest = text[found.end() :]
+    following = re.search(rf"^#{{1,{len(found[1])}}} ", rest, re.MULTILINE)
+    return rest[: following.start()] if following else rest
+
+
+def first_cells(page, heading):
+    """Code in the first column of the tables below a heading."""
+    return set(CELL.findall(section(page, heading)))
+
+
+@pytest.fixture(scope="module")
+def run_tiny(library, tmp_path_factory):
+    """Train for a few steps into a folder of its own; return the folder."""
+    from flashdex.recipe import Recipe, validate
+    from flashdex.recipe.algo import AlgoConfig, TrainConfig
+    from flashdex.recipe.env import (
+        AssistConfig,
+        EnvConfig,
+        MotionsConfig,
+        PhysicsConfig,
+    )
+    from flashdex.training.run import train
+
+    def run(groups):
+        folder = tmp_path_factory.mktemp("runs") / groups
+        env = EnvConfig()
+        recipe = Recipe(
+            name="tiny",
+            total_env_steps=6 * 60,
+            run_dir=str(folder),
+            motions=MotionsConfig(library=str(library.path)),
+            physics=PhysicsConfig(num_threads=1),
+            env=EnvConfig(
+                num_envs=6,
+                attempt_share=0.5,
+                finger_mode="residual",
+                transforms={**env.transforms, "object_points": {"num_points": 4}},
+                rewards={**env.rewards, "object_pose": {}},
+                assist=AssistConfig(enabled=True),
+            ),
+            algo=AlgoConfig(groups=groups, updates_per_step=0.2, **SIZES),
+            train=TrainConfig(certify=False),
+        )
+        return train(validate(recipe))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def tiny_run(run_tiny):
+    return run_tiny("per_hand")
+
+
+def read_rows(file):
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def logged_keys(run_dir):
+    return {key for row in read_rows(run_dir / "metrics.jsonl") for key in row}
+
+
+def general(key):
+    """A logged key as the glossary writes it: one entry for all hands."""
+    key = re.sub(r"^(reward|error)/(left|right)/", r"\1/<hand>/", key)
+    return re.sub(r"^loss/(left|right|both)/", "loss/<group>/", key)
+
+
+def test_options_page_is_up_to_date():
+    page = (DOCS / "options.md").read_text()
+    assert page == load_script("make_options").render(), (
+        "run: python docs/make_options.py"
+    )
+
+
+def test_every_link_leads_somewhere():
+    check = load_script("check_links")
+    assert [line for page in check.pages() for line in check.broken_links(page)] == []
+
+
+def test_glossary_names_exactly_the_logged_keys(tiny_run, run_tiny):
+    logged = logged_keys(tiny_run) | logged_keys(run_tiny("unified"))
+    assert any(key.startswith("loss/both/") for key in logged)
+    assert {general(key) for key in logged} == first_cells("metrics.md", "Glossary")
+
+
+def test_run_page_names_exactly_the_keys_of_an_attempt(tiny_run):
+    lines = read_rows(tiny_run / "conversions.jsonl")
+    assert lines
+    keys = {key for line in lines for key in line}
+    stored = {"rollout", "verdict"}  # of conversions only
+    assert keys | stored == first_cells("runs.md", "conversions.jsonl")
+
+
+def test_run_page_names_every_file(tiny_run):
+    named = {name.rstrip("/") for name in first_cells("runs.md", "Files")}
+    written = {path.name for path in tiny_run.iterdir()}
+    assert written <= named
+
+
+def test_run_page_names_exactly_the_keys_of_a_rollout():
+    import dataclasses
+
+    from flashdex.metrics.rollout import Rollout
+
+    keys = {field.name for field in dataclasses.fields(Rollout)} | {"schema"}
+    assert keys == first_cells("runs.md", "rollouts")
+
+
+def test_run_page_names_exactly_the_parts_of_a_certificate():
+    import dataclasses
+
+    from flashdex.metrics.certificate import Certificate
+
+    parts = {field.name for field in dataclasses.fields(Certificate)}
+    assert parts == first_cells("runs.md", "Certificates")
+
+
+def test_criteria_page_names_exactly_the_criteria():
+    from flashdex.metrics.criteria_table import make_criteria
+
+    names = {criterion.name for criterion in make_criteria()}
+    assert names == first_cells("metrics.md", "Criteria")
+
+
+def test_data_page_names_exactly_the_frame_entries():
+    from flashdex.motions.library import FRAME_KEYS
+
+    assert set(FRAME_KEYS) == first_cells("data.md", "frames")
+
+
+def test_data_page_names_exactly_the_codes_of_a_report():
+    code = re.compile(r'"([ERW]_[A-Z]+)"')
+    files = [ROOT / "flashdex/motions" / f for f in ("checks.py", "process.py")]
+    written = {name for file in files for name in code.findall(file.read_text())}
+    assert written == first_cells("data.md", "Codes")
+
+
+def test_data_page_names_exactly_the_columns_of_a_report(tmp_path):
+    from flashdex.motions.prepare import prepare
+
+    out = tmp_path / "library"
+    prepare("procedural", "pick_sphere_right", out=out, progress=False)
+    with (out / "report.csv").open() as file:
+        columns = set(next(csv.reader(file)))
+    assert columns == first_cells("data.md", "report.csv")
+
+
+def test_readme_names_exactly_the_verbs():
+    (verbs,) = (
+        action.choices
+        for action in make_parser()._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
+    rows = re.findall(
+        r"^\| (`[^|]+) \|", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    named = {word for row in rows for word in re.findall(r"`([a-z]+)`", row)}
+    assert named == set(verbs)
+
+
+def test_extend_page_names_files_that_exist():
+    text = (DOCS / "extend.md").read_text()
+    files = set(re.findall(r"`((?:flashdex|recipes|tests|docs)/[\w/.]+)`", text))
+    assert files
+    assert [name for name in sorted(files) if not (ROOT / name).exists()] == []

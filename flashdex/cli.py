@@ -25,6 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the words after `flashdex`; None reads the command line.
     """
+    # Waiting threads that spin take the cores from the physics; read by OpenMP when
+    # torch is first imported, so it has to stand before every lazy import below.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     parser = make_parser()
     args, rest = parser.parse_known_args(argv)
     _take_overrides(parser, args, rest)
@@ -138,7 +141,9 @@ def _add_run_verbs(
 
     verb = add("bench", _bench, "measure; prints JSON")
     verb.add_argument("what", choices=["env"], help="what to measure")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    verb.add_argument(
+        "words", nargs=argparse.REMAINDER, help="options of it; try: bench env --help"
+    )
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -164,7 +169,7 @@ def _cp(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from flashdex.recipe.validate import validate_paths
+    from flashdex.recipe.check_files import validate_paths
 
     for path in validate_paths(args.paths):
         print(f"ok  {path}")
@@ -266,7 +271,7 @@ def _report(args: argparse.Namespace) -> int:
 def _bench(args: argparse.Namespace) -> int:
     from flashdex.bench.env import main as bench_env
 
-    bench_env(args.overrides)
+    bench_env(args.words)
     return 0
 
 

@@ -184,27 +184,52 @@ def test_data_page_names_exactly_the_columns_of_a_report(tmp_path):
     from flashdex.motions.prepare import prepare
 
     out = tmp_path / "library"
-    prepare("procedural", "pick_sphere_right", out=out, progress=False)
+    made = {"out": out, "cache_dir": tmp_path / "cache", "progress": False}
+    prepare("procedural", "pick_sphere_right", **made)
     with (out / "report.csv").open() as file:
         columns = set(next(csv.reader(file)))
     assert columns == first_cells("data.md", "report.csv")
 
 
-def test_readme_names_exactly_the_verbs():
-    (verbs,) = (
+@pytest.mark.parametrize("group", ["", "ablation"])
+def test_recipe_page_names_exactly_the_recipes_and_ablations(group):
+    names = {path.stem for path in (ROOT / "recipes" / group).glob("*.yaml")}
+    cells = first_cells("recipes.md", "Ablations" if group else "Recipes")
+    assert cells == names if group else names <= cells
+
+
+def test_data_page_names_exactly_the_options_of_prepare():
+    options = {
+        word
+        for action in verbs()["prepare"]._actions
+        for word in action.option_strings
+        if word.startswith("--")
+    }
+    named = {c for c in first_cells("data.md", "Data") if c.startswith("--")}
+    assert named == options - {"--help", "--debug"}
+
+
+def verbs():
+    """Parser of each verb."""
+    (found,) = (
         action.choices
         for action in make_parser()._actions
         if isinstance(action, argparse._SubParsersAction)
     )
+    return found
+
+
+def test_readme_names_exactly_the_verbs():
     rows = re.findall(
         r"^\| (`[^|]+) \|", (ROOT / "README.md").read_text(), re.MULTILINE
     )
     named = {word for row in rows for word in re.findall(r"`([a-z]+)`", row)}
-    assert named == set(verbs)
+    assert named == set(verbs())
 
 
 def test_extend_page_names_files_that_exist():
     text = (DOCS / "extend.md").read_text()
-    files = set(re.findall(r"`((?:flashdex|recipes|tests|docs)/[\w/.]+)`", text))
+    named = re.findall(r"`((?:flashdex|recipes|tests|docs)/[\w/.]+)`", text)
+    files = {name for name in named if "NAME" not in name}
     assert files
     assert [name for name in sorted(files) if not (ROOT / name).exists()] == []

@@ -151,7 +151,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise LibraryError(
             f"{path} is not a motion library: no manifest.json. "
-            f"Make one: flashdex prepare <source> --out {path}"
+            f"Make one: flashdex prepare --source ... --out {path}"
         )
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"))

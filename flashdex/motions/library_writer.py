@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -124,10 +125,20 @@ class LibraryWriter:
             _write_meshes(work, name, asset)
             for name, asset in zip(names, self._objects.values(), strict=True)
         ]
-        self._stack_frames().memmap(str(work / "frames"))
-        self._stack_motions().memmap(str(work / "motions"))
-        objects = _stack_objects(list(self._objects.values()))
-        objects.memmap(str(work / "objects"))
+        tables = {
+            "frames": self._stack_frames(),
+            "motions": self._stack_motions(),
+            "objects": _stack_objects(list(self._objects.values())),
+        }
+        # Writing to a mapped file on a full disk kills the process: ask beforehand.
+        needed = sum(table.bytes() for table in tables.values())
+        free = shutil.disk_usage(work).free
+        if needed > free:
+            raise OSError(
+                errno.ENOSPC, f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
+            )
+        for name, table in tables.items():
+            table.memmap(str(work / name))
         manifest = self._manifest | {
             "motions": [{"name": r.name, **r.info} for r in self._records],
             "objects": [

@@ -42,7 +42,8 @@ class MotionsConfig:
     seed: int = number(0, low=0)
     """Seed of procedural motions and of preparation."""
     control_hz: float = number(60.0, above=0)
-    """Control rate, 1/s; read off the library when one is given."""
+    """Control rate at which a source is prepared, 1/s; a library keeps its own, which
+    must be one over physics.timestep x physics.decimation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ class PhysicsConfig:
     """The physics engine and its numbers."""
 
     engine: Literal["cpu", "warp", "brax"] = "cpu"
-    """cpu = mujoco.batch threads; warp = MuJoCo Warp on a GPU; brax = MJX."""
+    """cpu = mujoco.batch threads. warp and brax are refused in this version."""
     decimation: int = number(4, low=1)
     """Physics substeps a control step; fewer is faster and less stable."""
     timestep: float = number(1 / 240, above=0)

@@ -36,8 +36,8 @@ class ObjectPointsOptions:
 class FutureWindowOptions:
     """Reference of the coming frames relative to the current simulation."""
 
-    horizon: int = number(10, low=5, high=60)
-    """Frames in the window, control steps; the encoder needs at least 5."""
+    horizon: int = number(10, low=6, high=60)
+    """Frames in the window, control steps; the encoder needs at least 6."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,8 +233,8 @@ def build_options(
         Name to an instance of the option dataclass of that name.
 
     Example:
-        >>> build_options("transforms", {"future_window": {"horizon": 5}})
-        {'future_window': FutureWindowOptions(horizon=5)}
+        >>> build_options("transforms", {"future_window": {"horizon": 6}})
+        {'future_window': FutureWindowOptions(horizon=6)}
     """
     known = REGISTRY[kind]
     for name in mapping:

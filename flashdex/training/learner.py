@@ -160,7 +160,9 @@ class Learner:
             quiet = self._joint(self.policy(shown.copy()))
         if not explore:
             return quiet
-        if self.ready or self.config.warmup == "policy":
+        # A resumed learner starts with an empty buffer, but not without a policy.
+        trained = self.ready or self.stepper.updates > 0
+        if trained or self.config.warmup == "policy":
             with set_exploration_type(ExplorationType.RANDOM):
                 noisy = self._joint(self.policy(shown.copy()))
         else:

@@ -169,8 +169,8 @@ class Ledger:
         """Converted motions whose certificate holds."""
         return sum(bool(c.certified) for c in self.conversions.values())
 
-    def metrics(self, gpu_hours: float) -> dict[str, float]:
-        """Counters of the ``convert/`` group."""
+    def metrics(self, hours: float) -> dict[str, float]:
+        """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
         passing = sum(self.last.get(n, False) for n in self.names)
         out = {
@@ -180,8 +180,8 @@ class Ledger:
             "convert/certified": float(self.num_certified),
             "convert/attempts": float(sum(self.attempts.values())),
         }
-        if gpu_hours > 0:
-            out["convert/per_gpu_hour"] = self.num_converted / gpu_hours
+        if hours > 0:
+            out["convert/per_hour"] = self.num_converted / hours
         return out
 
 

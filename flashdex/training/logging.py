@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from flashdex.errors import MissingExtraError
+from flashdex.errors import FlashdexError
 
 if TYPE_CHECKING:
     from flashdex.recipe import Recipe
@@ -90,7 +90,10 @@ class WandbWriter:
         try:
             import wandb
         except ImportError as error:
-            raise MissingExtraError("wandb", extra="wandb") from error
+            raise FlashdexError(
+                "logger.kind: 'wandb' is named, but the package is not installed. "
+                "Install it (pip install wandb) or take it out of logger.kind."
+            ) from error
         c = recipe.logger
         self._run = wandb.init(
             project=c.wandb_project,

@@ -116,7 +116,7 @@ class Trainer:
         self.stats.add_step(self.env.info.outcome, done, terminated)
         self._learn()
         self._assist_epoch()
-        with self.stats.time("env"):
+        with self.stats.time("reset"):
             return self._advance(td, done)
 
     def _advance(self, td: TensorDictBase, done: Tensor) -> TensorDictBase:
@@ -175,7 +175,7 @@ class Trainer:
             "hours": self.wall_s / 3600,
             "updates": self.learner.stepper.updates,
         }
-        record.update(self.ledger.metrics(0.0))
+        record.update(self.ledger.metrics(self.wall_s / 3600))
         record.update(self.stats.pop(seconds, self.env.num_envs))
         record["buffer/rows"] = len(self.learner.buffer)
         assist = self.env.assist

@@ -121,7 +121,11 @@ def _promises(run: RunData) -> Html:
     lines = []
     for promise in run.recipe.get("expect") or []:
         at, key = promise["at_env_steps"], promise["metric"]
-        reached = [r for r in run.metrics if r["env_steps"] >= at and key in r]
+        records = [r for r in run.metrics if key in r]
+        reached = [r for r in records if r["env_steps"] >= at]
+        # A run that has converted everything has nothing more to reach.
+        if records and records[-1].get("convert/rate") == 1.0:
+            reached = reached or records[-1:]
         bounds = [
             f"{k} {promise[k]:g}" for k in ("min", "max") if promise.get(k) is not None
         ]

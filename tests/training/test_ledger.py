@@ -116,7 +116,7 @@ def test_only_the_first_pass_is_a_conversion(tmp_path, library, passing):
     assert metrics["convert/cumulative"] == 1
     assert metrics["convert/rate"] == pytest.approx(1 / 3)
     assert metrics["convert/attempts"] == 2
-    assert metrics["convert/per_gpu_hour"] == 0.5
+    assert metrics["convert/per_hour"] == 0.5
 
 
 def test_the_stored_verdict_is_that_of_a_fresh_certificate(tmp_path, library, passing):

@@ -4,95 +4,19 @@ import json
 import math
 import re
 
-import mujoco
-import numpy as np
 import pytest
 import yaml
+from pushed_box import make_rollout
 
 from flashdex.cli import main
-from flashdex.keys import FINGERS
 from flashdex.metrics.certificate import certify
-from flashdex.metrics.rollout import Rollout
 
-FRAMES, DECIMATION = 36, 4
 EVIL = '<script>alert("x")</script> & co'
-SITES = "".join(f'<site name="left_pad_{f}" pos=".02 0 0"/>' for f in FINGERS)
-SCENE = f"""
-<mujoco>
-  <option timestep="0.004166666666666667"/>
-  <worldbody>
-    <geom type="plane" size="1 1 .1" rgba=".9 .9 .9 1"/>
-    <body name="left_base" pos="-.08 0 .03">
-      <joint name="left_slide" type="slide" axis="1 0 0" damping="1"/>
-      <geom type="box" size=".02 .04 .02" mass=".2"/>{SITES}
-    </body>
-    <body name="box" pos="0 0 .03">
-      <freejoint name="box"/>
-      <geom type="box" size=".03 .05 .03" mass=".3" rgba=".9 .2 .1 1"/>
-    </body>
-  </worldbody>
-  <actuator><position joint="left_slide" kp="400" kv="20"/></actuator>
-</mujoco>"""
-
-
-def make_rollout(**changes):
-    """A finger pushes a box; the reference is what happened, 5 mm beside it."""
-    model = mujoco.MjModel.from_xml_string(SCENE)
-    data = mujoco.MjData(model)
-    ctrl = np.linspace(0, 0.15, FRAMES)[:, None]
-    qpos, qvel, tips, links = [], [], [], []
-    for row in ctrl:
-        data.ctrl[:] = row
-        mujoco.mj_step(model, data, nstep=DECIMATION)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-        after = mujoco.MjData(model)
-        after.qpos[:] = data.qpos
-        mujoco.mj_forward(model, after)
-        tips.append(after.site_xpos.copy())
-        links.append(after.xpos[[model.body("left_base").id] * 2])
-    qpos, qvel, tips, links = map(np.array, (qpos, qvel, tips, links))
-    tips = np.stack([tips, np.zeros_like(tips)], 1)
-    links = np.stack([links, np.zeros_like(links)], 1)
-    pos, quat = qpos[:, None, 1:4], qpos[:, None, 4:8]
-    values = {
-        "motion": "push",
-        "hand": "finger",
-        "fps": 60.0,
-        "decimation": DECIMATION,
-        "grace": 15,
-        "qpos0": model.qpos0.copy(),
-        "qvel0": np.zeros(model.nv),
-        "ctrl": ctrl,
-        "qpos": qpos,
-        "qvel": qvel,
-        "object_pos": pos,
-        "object_quat": quat,
-        "ref_object_pos": pos + np.array([0, 0.005, 0]),
-        "ref_object_quat": quat.copy(),
-        "fingertips": tips,
-        "ref_fingertips": tips.copy(),
-        "joints": links,
-        "ref_joints": links.copy(),
-        "hand_active": np.array([True, False]),
-        "hand_object": np.array([0, -1]),
-        "object_qpos_adr": np.array([1]),
-        "object_qvel_adr": np.array([1]),
-        "joint_bodies": json.dumps([["left_base", "left_base"], []]),
-        "model_xml": SCENE,
-        "criterion": "sr_mt_obj",
-        "errors": "{}",
-        "versions": "{}",
-        "seed": 3,
-        "env_steps": 1000,
-        "actions": np.zeros((FRAMES, 2, 1), dtype=np.float32),
-    }
-    return Rollout(**{**values, **changes})
 
 
 @pytest.fixture(scope="session")
 def rollout():
-    return make_rollout()
+    return make_rollout(frames=36, criterion="sr_mt_obj", beside=0.005)
 
 
 @pytest.fixture(scope="session")

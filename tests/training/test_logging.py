@@ -1,0 +1,69 @@
+"""Metric writers: what goes in comes out of every file, W&B's offline run included."""
+
+import csv
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flashdex.recipe import LoggerConfig, Recipe
+from flashdex.training.logging import MetricLog
+
+RECORDS = [
+    {"env_steps": 48, "hours": 0.01, "convert/cumulative": 0.0},
+    {"env_steps": 96, "hours": 0.02, "convert/cumulative": 2.0},
+]
+
+
+def write_records(run_dir: Path, **logger) -> MetricLog:
+    recipe = Recipe(name="tiny", total_env_steps=100, logger=LoggerConfig(**logger))
+    log = MetricLog(run_dir, recipe)
+    for record in RECORDS:
+        log.write(record)
+    log.close()
+    return log
+
+
+def test_json_lines_are_written_whatever_the_recipe_names(tmp_path):
+    write_records(tmp_path, kind=["csv"])
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == RECORDS
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["convert/cumulative"]) for r in rows] == [0.0, 2.0]
+
+
+def test_csv_keeps_its_columns_after_a_resume(tmp_path):
+    write_records(tmp_path, kind=["csv"])
+    write_records(tmp_path, kind=["csv"])
+    lines = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert lines[0] == "env_steps,hours,convert/cumulative"
+    assert len(lines) == 5
+
+
+def test_wandb_offline_run_holds_the_records(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    log = write_records(tmp_path, kind=["wandb"], wandb_mode="offline")
+    assert log.wandb_id
+    files = list(tmp_path.glob("wandb/offline-run-*/run-*.wandb"))
+    assert len(files) == 1
+    assert log.wandb_id in files[0].name
+    # the store is binary; keys of the history stand in it as text. W&B's own process
+    # writes it and may still be at it.
+    end = time.monotonic() + 30
+    while b"convert/cumulative" not in files[0].read_bytes():
+        assert time.monotonic() < end, "the history never reached the file"
+        time.sleep(0.1)
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == len(RECORDS)
+
+
+def test_wandb_is_named_when_it_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    from flashdex.errors import FlashdexError
+
+    recipe = Recipe(name="tiny", total_env_steps=100)
+    recipe = replace(recipe, logger=LoggerConfig(kind=["wandb"]))
+    with pytest.raises(FlashdexError, match="pip install wandb"):
+        MetricLog(tmp_path, recipe)

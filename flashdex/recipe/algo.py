@@ -114,6 +114,9 @@ class TrainConfig:
     """Stop cleanly after this many seconds; null = never."""
     stop_when_all_converted: bool = True
     """Stop once every motion is converted."""
+    torch_threads: int = number(0, low=0)
+    """Threads of the learner on a CPU; 0 = torch's choice. With small networks more
+    threads wait for each other longer than they compute."""
     criterion: Criterion = "sr_mt_obj"
     """What counts as a conversion (see docs on criteria)."""
     certify: bool = True

@@ -109,6 +109,8 @@ def _git(*args: str) -> str:
 def _train(bench: Workbench, run_dir: Path, state: dict[str, Any] | None) -> Path:
     recipe = bench.recipe
     torch.manual_seed(recipe.seed)
+    if recipe.train.torch_threads:
+        torch.set_num_threads(recipe.train.torch_threads)
     baselines = score_baselines(bench, run_dir / BASELINES)
     env = bench.make_env()
     learner = bench.make_learner(env)

@@ -14,7 +14,7 @@ help:
 	@echo "make quickstart  train four small motions on the CPU, minutes"
 	@echo "make test        tests (no GPU, no data, no network)"
 	@echo "make check       lint, format, types, recipes, links"
-	@echo "make bench       environment steps per second, as JSON"
+	@echo "make bench       environment steps per second, as JSON; learning and slow tests"
 	@echo "make docs        check the links of the pages"
 	@echo "make clean       remove what was made, runs excepted"
 
@@ -59,8 +59,10 @@ check: $(DEV)
 	$(BIN)/flashdex validate recipes
 	$(BIN)/python docs/check_links.py
 
-bench: $(CORE)
-	$(BIN)/flashdex bench env
+bench: $(DEV)
+	$(BIN)/flashdex bench env --num-envs 64
+	$(BIN)/flashdex bench env --num-envs 512
+	$(BIN)/python -m pytest -m "learn or slow"
 
 docs: $(CORE)
 	$(BIN)/python docs/check_links.py

@@ -182,7 +182,7 @@ class AssistSchedule:
         c = self.config
         if self.epoch < c.wait_epochs:
             return False
-        if self._levels and self.epoch - self._changed_at < c.cooldown_epochs:
+        if self._changed_at and self.epoch - self._changed_at < c.cooldown_epochs:
             return False
         task, imitation, cloning, completion = self._means()
         gates = (

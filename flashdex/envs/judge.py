@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -50,6 +51,7 @@ class Judge:
         config: environment part of the recipe.
         step_dt: control step, s.
         num_envs: worlds N.
+        lead_s: how far targets run ahead of the reference, s, (2, J) or ().
         evaluation: judge errors and rewards, but end nothing except on bad numbers.
     """
 
@@ -61,9 +63,10 @@ class Judge:
         *,
         step_dt: float,
         num_envs: int,
+        lead_s: Tensor,
         evaluation: bool = False,
     ) -> None:
-        self.bank, self.step_dt = bank, step_dt
+        self.bank, self.step_dt, self.lead_s = bank, step_dt, lead_s
         self.rewards = build_options("rewards", config.rewards)
         self.terminations = build_options("terminations", config.terminations)
         if evaluation:
@@ -109,7 +112,7 @@ class Judge:
         own = gather_own(state[keys.OBJECT_POSE], slot)
         active = self.bank.hand_active[motion]
         present = self.bank.has_object[motion]
-        terms = self._terms(kin, ref, own, action, target, motion)
+        terms = self._finite_terms(kin, ref, own, action, target, motion)
         for name in ("object_points", "object_pose", "fingertip_distance"):
             if name in terms:
                 terms[name] = terms[name] * present
@@ -133,6 +136,10 @@ class Judge:
             object_rot_error=quat_angle(own[..., 3:], ref["own_quat"]) * present,
             active=active,
         )
+
+    def _finite_terms(self, *args: Any) -> dict[str, Tensor]:
+        """Reward terms; a diverged world earns nothing, but still pays for failing."""
+        return {k: torch.nan_to_num(v) for k, v in self._terms(*args).items()}
 
     def _terms(
         self,
@@ -183,8 +190,9 @@ class Judge:
                         kin["tip_pos"], ref["tip_pos"], scale=o.scale
                     )
                 case "behaviour_cloning":
+                    leading = ref["joint_pos"] + self.lead_s * ref["joint_vel"]
                     out[name] = rewards.behaviour_cloning_exp(
-                        target, ref["joint_pos"], self.joint_span, scale=o.scale
+                        target, leading, self.joint_span, scale=o.scale
                     )
                 case "action_l2":
                     out[name] = rewards.action_l2(action)

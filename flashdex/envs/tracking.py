@@ -78,19 +78,24 @@ class TrackingEnv(EnvBase):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([n]))
         self.physics, self.bank, self.hands, self.config = physics, bank, hands, config
         self.step_dt = step_dt
-        self.group_map = {side: [side] for side in keys.SIDES}
-        self.num_envs = n
+        self.group_map, self.num_envs = {side: [side] for side in keys.SIDES}, n
         self.num_attempts = n if evaluation else round(config.attempt_share * n)
         self.attempt = torch.arange(n) < self.num_attempts
         self.kinematics = HandKinematics(hands)
         ranges = [torch.as_tensor(hands[s].joint_range) for s in keys.SIDES]
         self.joint_range = torch.stack(ranges).float()
+        self.lead_s = torch.zeros(()) if lead_s is None else lead_s
         self.judge = Judge(
-            bank, hands, config, step_dt=step_dt, num_envs=n, evaluation=evaluation
+            bank,
+            hands,
+            config,
+            step_dt=step_dt,
+            num_envs=n,
+            lead_s=self.lead_s,
+            evaluation=evaluation,
         )
         self.sampler = SAMPLERS[config.sampler](bank.num_motions)
         self.attempt_sampler = UnconvertedSampler(bank.num_motions)
-        self.lead_s = torch.zeros(()) if lead_s is None else lead_s
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
         scale = [config.wrist_pos_scale] * 3 + [config.wrist_rot_scale] * 3
         self._wrist_scale = torch.tensor(scale)

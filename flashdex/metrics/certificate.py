@@ -37,6 +37,8 @@ from flashdex.metrics.verdict import CertificateVerdict, Verdict
 
 CERTIFICATE_SCHEMA = 1
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
+# mm; the scored object positions and the stored states are copies of one another
+MISMATCH_MM = 1e-3
 DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
 
 
@@ -126,10 +128,12 @@ def certify(
         None if rollout.wrench is None else float(np.abs(rollout.wrench).max())
     )
     assists = assist_sources(scene.model, scene.object_body)
+    deviation = _deviation(scene, rollout, nominal)
     verdict, reason = _decide(
         verdicts[criterion],
         [run[criterion] for run in runs],
         is_assisted=bool(assists) or (stored_wrench or nominal.wrench_max) > 0,
+        mismatch_mm=deviation["stored_mismatch_mm"],
     )
     return Certificate(
         verdict=verdict,
@@ -145,7 +149,7 @@ def certify(
             "assist_sources": assists,
         },
         nominal={name: v.to_dict() for name, v in verdicts.items()},
-        deviation=_deviation(scene, rollout, nominal),
+        deviation=deviation,
         perturbed=_perturbed_part(runs, seed, settings),
         safety=_safety_part(scene, nominal, monitor),
         provenance=_provenance(rollout),
@@ -153,10 +157,16 @@ def certify(
 
 
 def _decide(
-    nominal: Verdict, runs: list[Verdict], *, is_assisted: bool
+    nominal: Verdict,
+    runs: list[Verdict],
+    *,
+    is_assisted: bool,
+    mismatch_mm: float = 0.0,
 ) -> tuple[CertificateVerdict, str]:
     if nominal.state == "not_measured":
         return "not_measured", nominal.reason
+    if mismatch_mm > MISMATCH_MM:
+        return "failed", "stored_states"
     if is_assisted:
         return "failed", "assist"
     if not nominal.is_passed:

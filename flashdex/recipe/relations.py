@@ -91,6 +91,11 @@ def _algo(recipe: Recipe) -> list[str]:
 def _env(recipe: Recipe) -> list[str]:
     env = recipe.env
     problems = []
+    if env.attempt_share > 0 and round(env.attempt_share * env.num_envs) == 0:
+        problems.append(
+            f"env.attempt_share: {env.attempt_share} of {env.num_envs} worlds is none, "
+            f"so nothing could ever be converted; give at least {1 / env.num_envs:.3g}"
+        )
     if not any(options is not None for options in env.transforms.values()):
         problems.append("env.transforms: all are off; the policy would see nothing")
     if env.attempt_share >= 1:

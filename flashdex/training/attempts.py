@@ -57,6 +57,7 @@ class _Track:
     qvel: list[np.ndarray] = field(default_factory=list)
     ctrl: list[np.ndarray] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
+    wrench: list[np.ndarray] = field(default_factory=list)
 
 
 class AttemptRecorder:
@@ -69,14 +70,23 @@ class AttemptRecorder:
         env: the environment, on the CPU engine.
         criterion: what the rollouts are judged by.
         seed: of the run.
+        provenance: hashes of recipe and library, date; stored with every rollout.
     """
 
-    def __init__(self, env: TrackingEnv, *, criterion: str, seed: int) -> None:
+    def __init__(
+        self,
+        env: TrackingEnv,
+        *,
+        criterion: str,
+        seed: int,
+        provenance: dict[str, str] | None = None,
+    ) -> None:
         if not isinstance(env.physics, CpuPhysics):
             msg = "attempts are recorded on the cpu engine only"
             raise TypeError(msg)
         self.env, self.physics = env, env.physics
         self.criterion, self.seed = criterion, seed
+        self.provenance = json.dumps(provenance or {})
         self._tracks: dict[int, _Track] = {}
 
     def begin(self, env_ids: Tensor) -> None:
@@ -103,6 +113,7 @@ class AttemptRecorder:
             track.qpos.append(qpos)
             track.qvel.append(qvel)
             track.ctrl.append(ctrl)
+            track.wrench.append(self.physics.applied_wrench(env))
             track.actions.append(action[env].numpy().copy())
             if done[env]:
                 finished.append(self._finish(env, track, env_steps))
@@ -121,7 +132,10 @@ class AttemptRecorder:
             if mask[env, i]
         ]
         rollout = self._rollout(env, track, motion, env_steps)
-        return Attempt(rollout, motion, not why, why, int(info.frame[env]))
+        frame = int(info.frame[env])
+        # A time-out before the end of the motion is no failure, but not complete.
+        ended = frame >= int(self.env.bank.length[motion]) - 1
+        return Attempt(rollout, motion, not why and ended, why, frame)
 
     def _rollout(self, env: int, track: _Track, motion: int, env_steps: int) -> Rollout:
         physics, bank = self.physics, self.env.bank
@@ -185,6 +199,8 @@ class AttemptRecorder:
             env_steps=env_steps,
             actions=np.stack(track.actions),
             num_ref_frames=int(bank.length[motion]) - 1,
+            wrench=np.stack(track.wrench),
+            provenance=self.provenance,
         )
 
     def _joints(

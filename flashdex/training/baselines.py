@@ -14,6 +14,8 @@ from torch import Tensor
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.files import write_atomic
 from flashdex.metrics.criteria import score
+from flashdex.metrics.trivial import frozen_object
+from flashdex.training.attempts import grace_steps
 from flashdex.training.rollouts import roll_all
 from flashdex.training.setup import Workbench
 
@@ -79,6 +81,32 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
                 "state": verdict.state,
                 "errors": {k: round(v, 5) for k, v in verdict.values.items()},
             }
+    rows = {"frozen_object": _score_frozen(bench), **rows}
     if path is not None:
         write_atomic(path, json.dumps(rows, indent=1))
     return Baselines(rows)
+
+
+def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
+    """``frozen_object``: objects stay at their first reference pose."""
+    bank, criterion = bench.bank, bench.recipe.train.criterion
+    out: dict[str, dict[str, Any]] = {}
+    for row, name in enumerate(bank.names):
+        frames = torch.arange(int(bank.length[row]))
+        ref = bank.at(torch.full_like(frames, row), frames)
+        slots = torch.where(bank.has_object[row], bank.hand_slot[row], -1)
+        signals = frozen_object(
+            ref["object_pos"].double(),
+            ref["object_quat"].double(),
+            hand_active=bank.hand_active[row].tolist(),
+            hand_object=slots.tolist(),
+            fps=bank.fps,
+        )
+        verdicts = score(signals, grace=grace_steps(bank.fps))
+        verdict = verdicts[criterion]
+        out[name] = {
+            "passed": [k for k, v in verdicts.items() if v.is_passed],
+            "state": verdict.state,
+            "errors": {k: round(v, 5) for k, v in verdict.values.items()},
+        }
+    return out

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flashdex import keys
+from flashdex.errors import RunError
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
 from flashdex.training.attempts import Attempt
+from flashdex.training.jsonl import drop_cut_line, read_lines
 
+_LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"
 ROLLOUTS = "rollouts"
 
@@ -25,13 +29,15 @@ class Conversion:
         motion: name.
         env_steps: counter when it passed.
         wall_s: seconds since the run began.
-        certified: verdict of the certificate, None when none was asked for.
+        certified: whether its certificate holds, None when none was asked for.
+        verdict: verdict of the certificate.
     """
 
     motion: str
     env_steps: int
     wall_s: float
     certified: bool | None
+    verdict: str | None = None
 
 
 class Ledger:
@@ -76,7 +82,10 @@ class Ledger:
         """Take up the lines of an earlier session of the same run."""
         drop_cut_line(self.path)
         for line in read_lines(self.path):
-            self._count(line)
+            # A resume may ask for another criterion, or for fewer motions.
+            same = line["criterion"] == self.criterion
+            if same and line["motion"] in self.names:
+                self._count(line)
 
     def _count(self, line: dict[str, Any]) -> None:
         name = line["motion"]
@@ -90,6 +99,9 @@ class Ledger:
             self.conversions[name] = Conversion(
                 name, line["env_steps"], line["wall_s"], line["certified"]
             )
+        if line.get("verdict") is not None:
+            self.conversions[name].certified = line["certified"]
+            self.conversions[name].verdict = line["verdict"]
 
     def record(
         self, attempt: Attempt, *, env_steps: int, wall_s: float
@@ -112,6 +124,9 @@ class Ledger:
         converted = verdict.is_passed
         name = rollout.motion
         first = converted and name not in self.conversions
+        # One lucky draw is not the last word: later passes may still be proven.
+        unproven = self.certify and not first and converted
+        unproven = unproven and not self.conversions[name].certified
         line: dict[str, Any] = {
             "motion": name,
             "converted": converted,
@@ -134,7 +149,7 @@ class Ledger:
             "engine": self.engine,
             "trivial": self.trivial.get(name, []),
         }
-        if first:
+        if first or unproven:
             line.update(self._store(attempt, line))
         self._append(line)
         self._count(line)
@@ -147,7 +162,11 @@ class Ledger:
         rollout.save(path)
         out: dict[str, Any] = {"rollout": f"{ROLLOUTS}/{path.name}"}
         if self.certify:
-            certificate = certify(rollout)
+            try:
+                certificate = certify(rollout)
+            except RunError as error:
+                _LOG.warning("%s: not certified: %s", rollout.motion, error)
+                return {**out, "certified": False, "verdict": "not_measured"}
             certificate.save(path.with_suffix(".certificate.json"))
             out["certified"] = certificate.verdict in ("certified", "robust")
             out["verdict"] = certificate.verdict
@@ -169,6 +188,11 @@ class Ledger:
         """Converted motions whose certificate holds."""
         return sum(bool(c.certified) for c in self.conversions.values())
 
+    @property
+    def num_robust(self) -> int:
+        """Converted motions whose certificate holds under disturbances too."""
+        return sum(c.verdict == "robust" for c in self.conversions.values())
+
     def metrics(self, hours: float) -> dict[str, float]:
         """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
@@ -178,6 +202,7 @@ class Ledger:
             "convert/rate": self.num_converted / total,
             "convert/last": passing / total,
             "convert/certified": float(self.num_certified),
+            "convert/robust": float(self.num_robust),
             "convert/attempts": float(sum(self.attempts.values())),
         }
         if hours > 0:
@@ -205,33 +230,3 @@ def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str
             for b in blame
         ]
     return [{"cause": reason}] if reason else []
-
-
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read a JSONL file; a last line cut off by a crash is left out."""
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
-    out = []
-    for number, line in enumerate(lines):
-        try:
-            out.append(json.loads(line))
-        except ValueError:
-            if number < len(lines) - 1:
-                raise
-    return out
-
-
-def drop_cut_line(path: Path) -> None:
-    """Remove a last line that a crash cut off, or the next one would join it.
-
-    Args:
-        path: JSONL file; need not exist.
-    """
-    if not path.is_file():
-        return
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        with path.open("r+b") as file:
-            file.truncate(whole)

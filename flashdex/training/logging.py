@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from flashdex.errors import FlashdexError
+from flashdex.training.jsonl import drop_cut_line
 
 if TYPE_CHECKING:
     from flashdex.recipe import Recipe
@@ -35,6 +36,7 @@ class JsonlWriter:
     """
 
     def __init__(self, run_dir: Path) -> None:
+        drop_cut_line(run_dir / METRICS)
         self._file = (run_dir / METRICS).open("a", encoding="utf-8")
 
     def write(self, record: dict[str, float]) -> None:

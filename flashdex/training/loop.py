@@ -16,8 +16,11 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from flashdex import keys
+from flashdex.envs.judge import Outcome
 from flashdex.envs.tracking import TrackingEnv
+from flashdex.errors import RunError
 from flashdex.recipe import Recipe
+from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempts import AttemptRecorder
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.learner import Learner
@@ -36,6 +39,7 @@ class Trainer:
         learner: acts and learns.
         ledger: judges attempts.
         log: metric writers.
+        provenance: stored with every rollout.
     """
 
     def __init__(
@@ -46,13 +50,18 @@ class Trainer:
         learner: Learner,
         ledger: Ledger,
         log: MetricLog,
+        provenance: dict[str, str] | None = None,
     ) -> None:
         self.recipe, self.run_dir, self.env = recipe, run_dir, env
         self.learner, self.ledger, self.log = learner, ledger, log
         self.recorder = AttemptRecorder(
-            env, criterion=recipe.train.criterion, seed=recipe.seed
+            env,
+            criterion=recipe.train.criterion,
+            seed=recipe.seed,
+            provenance=provenance,
         )
         self.stats = RunningStats()
+        self.assist_epoch = AssistEpoch()
         self.env_steps = 0
         self.wall_before = 0.0
         self._update_debt = 0.0
@@ -113,9 +122,10 @@ class Trainer:
             terminated, done = after[keys.TERMINATED], after[keys.DONE]
             self.learner.remember(td, action, reward, after, terminated, done)
         assert self.env.info is not None
-        self.stats.add_step(self.env.info.outcome, done, terminated)
+        outcome = self.env.info.outcome
+        self.stats.add_step(outcome, done, terminated)
         self._learn()
-        self._assist_epoch()
+        self._assist_epoch(outcome, done, terminated)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
@@ -151,11 +161,14 @@ class Trainer:
             with self.stats.time("update"):
                 self.stats.add_update(self.learner.update())
 
-    def _assist_epoch(self) -> None:
+    def _assist_epoch(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
         assist = self.env.assist
-        if assist is None or self._vector_steps % assist.config.epoch_steps:
+        if assist is None:
             return
-        if assist.end_epoch(**self.stats.pop_epoch(self.recipe)):
+        self.assist_epoch.add(outcome, ~self.env.attempt, done, terminated)
+        if self._vector_steps % assist.config.epoch_steps == 0 and assist.end_epoch(
+            **self.assist_epoch.pop()
+        ):
             self.env.redraw_assist()
 
     def _end_reason(self) -> str:
@@ -243,7 +256,14 @@ class Trainer:
         self._vector_steps = state["vector_steps"]
         self.wall_before = state["wall_s"]
         self._update_debt = state["update_debt"]
-        self.learner.load_state_dict(state["learner"])
+        try:
+            self.learner.load_state_dict(state["learner"])
+        except RuntimeError as error:
+            raise RunError(
+                "the checkpoint does not fit the recipe: an override changed the "
+                f"networks, the observation or env.num_envs ({error}). Resume without "
+                "it, or start a new run."
+            ) from error
         self.learner.nstep.clear()
         self.learner.normalizer.clear_returns()
         if self.env.assist is not None and state["assist"] is not None:

@@ -60,15 +60,18 @@ def replay(run: str | Path) -> list[Replayed]:
             f"{run_dir}: {CONVERSIONS} names {missing[0]}, which is missing. A "
             "conversion without its rollout cannot be proven; restore the file."
         )
-    return [_replay_one(file) for file in files]
+    proven = {row["motion"] for row in claimed if row["certified"]}
+    return [_replay_one(file, proven) for file in files]
 
 
-def _replay_one(file: Path) -> Replayed:
+def _replay_one(file: Path, proven: set[str]) -> Replayed:
     rollout = Rollout.load(file)
     found = certify(rollout)
     path = file.with_suffix(".certificate.json")
     if not path.is_file():
-        return Replayed(rollout.motion, None, found.verdict, agrees=True)
+        # The run may not claim a proof that it does not hold.
+        agrees = rollout.motion not in proven
+        return Replayed(rollout.motion, None, found.verdict, agrees=agrees)
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import subprocess
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,8 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     run_dir = Path(run)
     recipe = load_run_recipe(run_dir, overrides)
     state = load_checkpoint(run_dir)
+    if overrides:
+        (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
     return _train(open_workbench(recipe), run_dir, state)
 
 
@@ -106,6 +110,16 @@ def _git(*args: str) -> str:
     return done.stdout if done.returncode == 0 else ""
 
 
+def _provenance(bench: Workbench) -> dict[str, str]:
+    """Where a rollout comes from, apart from the versions stored with it."""
+    manifest = (bench.library.path / "manifest.json").read_bytes()
+    return {
+        "recipe_sha256": hashlib.sha256(dump_recipe(bench.recipe).encode()).hexdigest(),
+        "library_sha256": hashlib.sha256(manifest).hexdigest(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
 def _train(bench: Workbench, run_dir: Path, state: dict[str, Any] | None) -> Path:
     recipe = bench.recipe
     torch.manual_seed(recipe.seed)
@@ -124,7 +138,9 @@ def _train(bench: Workbench, run_dir: Path, state: dict[str, Any] | None) -> Pat
         trivial=baselines.trivial(recipe.train.criterion),
     )
     log = MetricLog(run_dir, recipe, wandb_id=state["wandb_id"] if state else None)
-    trainer = Trainer(recipe, run_dir, env, learner, ledger, log)
+    trainer = Trainer(
+        recipe, run_dir, env, learner, ledger, log, provenance=_provenance(bench)
+    )
     if state is not None:
         trainer.load_state_dict(state)
     try:

@@ -16,15 +16,15 @@ from flashdex import keys
 
 if TYPE_CHECKING:
     from flashdex.envs.judge import Outcome
-    from flashdex.recipe import Recipe
-
-_IMITATION = ("wrist_pos", "wrist_rot", "fingertip_pos")
 
 
 class RunningStats:
     """Collects means of rewards, errors, episode ends, losses and phase times."""
 
     def __init__(self) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
         self._sums: dict[str, float | Tensor] = defaultdict(float)
         self._counts: dict[str, float | Tensor] = defaultdict(float)
         self._seconds: dict[str, float] = defaultdict(float)
@@ -32,8 +32,6 @@ class RunningStats:
         self._ends = {"terminated": 0, "truncated": 0}
         self._causes: dict[str, int] = defaultdict(int)
         self._steps = 0
-        self._epoch: list[dict[str, Tensor]] = []
-        self._epoch_ends = [0, 0]
 
     @contextmanager
     def time(self, phase: str) -> Iterator[None]:
@@ -71,37 +69,13 @@ class RunningStats:
         self._ends["truncated"] += ended - failed
         for name, cause in outcome.causes.items():
             self._causes[name] += int(cause.any(-1).sum())
-        self._epoch.append({k: v.sum(-1).mean() for k, v in outcome.terms.items()})
-        self._epoch_ends[0] += ended - failed
-        self._epoch_ends[1] += ended
 
     def add_update(self, metrics: TensorDictBase) -> None:
         """Take in the metrics of one update."""
         for key, value in metrics.items(True, True):
-            name = "/".join(reversed(key)) if isinstance(key, tuple) else key
-            full = f"loss/{'/'.join(key) if isinstance(key, tuple) else name}"
+            full = "loss/" + ("/".join(key) if isinstance(key, tuple) else key)
             self._sums[full] = self._sums[full] + value.detach().float().mean()
             self._counts[full] = self._counts[full] + 1
-
-    def pop_epoch(self, recipe: Recipe) -> dict[str, float]:
-        """Means of one assist epoch, as the gates of the schedule want them."""
-        rows, self._epoch = self._epoch, []
-        (completed, ended), self._epoch_ends = self._epoch_ends, [0, 0]
-
-        def mean(name: str) -> float:
-            if not rows or name not in rows[0]:
-                return 0.0
-            return float(torch.stack([r[name] for r in rows]).mean())
-
-        # Terms are summed over hands, each with half its weight: 1 is perfect.
-        task = 0.5 * max(mean("object_points"), mean("object_pose"))
-        imitation = sum(0.5 * mean(n) for n in _IMITATION) / len(_IMITATION)
-        return {
-            "task": task,
-            "imitation": imitation,
-            "cloning": 0.5 * mean("behaviour_cloning"),
-            "completion": completed / ended if ended else 1.0,
-        }
 
     def pop(self, seconds: float, num_envs: int) -> dict[str, float]:
         """Means since the last call, and forget them.
@@ -122,7 +96,5 @@ class RunningStats:
         out["perf/env_steps_per_s"] = self._steps * num_envs / seconds
         for phase, spent in self._seconds.items():
             out[f"perf/ms_{phase}"] = 1e3 * spent / max(self._calls[phase], 1)
-        epoch, ends_epoch = self._epoch, self._epoch_ends
-        self.__init__()
-        self._epoch, self._epoch_ends = epoch, ends_epoch
+        self._clear()
         return out

@@ -210,3 +210,9 @@ def test_certificate_is_a_json_file(rollout, tmp_path):
     assert data["model"]["iterations"] >= 100
     assert data["provenance"]["env_steps"] == 1000
     assert [p.name for p in path.parent.iterdir()] == ["push.json"]
+
+
+def test_scored_positions_that_are_not_the_stored_states_prove_nothing(rollout):
+    shifted = replace(rollout, object_pos=rollout.object_pos + 0.001)
+    certificate = certify(shifted, num_perturbations=0)
+    assert (certificate.verdict, certificate.reason) == ("failed", "stored_states")

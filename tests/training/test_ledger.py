@@ -158,3 +158,26 @@ def test_a_broken_line_in_the_middle_is_an_error(tmp_path):
     path.write_text('{"a": 1}\n{"b":\n{"c": 2}\n')
     with pytest.raises(ValueError, match="Expecting"):
         read_lines(path)
+
+
+def test_lines_of_another_criterion_or_motion_do_not_count(tmp_path, library, passing):
+    open_ledger(tmp_path, library).record(passing, env_steps=10, wall_s=2.0)
+    strict = open_ledger(tmp_path, library, criterion="sr_mt_obj_x0.5")
+    assert strict.num_converted == 0
+    (tmp_path / CONVERSIONS).write_text(
+        (tmp_path / CONVERSIONS).read_text().replace("right_box", "left_out")
+    )
+    assert open_ledger(tmp_path, library).num_converted == 0
+
+
+def test_a_later_pass_may_prove_what_the_first_could_not(tmp_path, library, passing):
+    unproven = copy.deepcopy(passing)  # its objects are moved: the certificate fails
+    ledger = open_ledger(tmp_path, library, certify=True)
+    first = ledger.record(unproven, env_steps=10, wall_s=2.0)
+    assert first is not None
+    assert not first.certified
+    assert ledger.record(unproven, env_steps=20, wall_s=3.0) is None
+    lines = read_lines(tmp_path / CONVERSIONS)
+    assert [bool(x.get("rollout")) for x in lines] == [True, True]
+    assert ledger.conversions[first.motion].env_steps == 10
+    assert ledger.metrics(1.0)["convert/robust"] == 0

@@ -67,3 +67,12 @@ def test_wandb_is_named_when_it_is_missing(tmp_path, monkeypatch):
     recipe = replace(recipe, logger=LoggerConfig(kind=["wandb"]))
     with pytest.raises(FlashdexError, match="pip install wandb"):
         MetricLog(tmp_path, recipe)
+
+
+def test_a_line_that_a_crash_cut_off_is_removed(tmp_path):
+    write_records(tmp_path, kind=["jsonl"])
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"env_steps": 14')
+    write_records(tmp_path, kind=["jsonl"])
+    lines = path.read_text().splitlines()
+    assert [json.loads(line) for line in lines] == RECORDS + RECORDS

@@ -162,6 +162,13 @@ class CpuPhysics:
         """Full-precision qpos, qvel and ctrl of one world, for stored rollouts."""
         return self._qpos[env].copy(), self._qvel[env].copy(), self._ctrl[env].copy()
 
+    def applied_wrench(self, env: int) -> np.ndarray:
+        """Force and torque on each object slot in the last substep, (O, 6)."""
+        out = np.zeros((self.num_slots, 6))
+        for slot, body in enumerate(self._obj_body):
+            out[slot] = self._xfrc[env, body]
+        return out
+
     def scene(self, env: int) -> Scene:
         """Scene that world ``env`` runs at present."""
         return self.scenes[int(self._motion[env])]

@@ -38,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         format="%(asctime)s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
         return args.run(args)
     except FlashdexError as error:
@@ -179,7 +180,7 @@ def _validate(args: argparse.Namespace) -> int:
 def _prepare(args: argparse.Namespace) -> int:
     from flashdex.motions.prepare import prepare
 
-    prepare(
+    library = prepare(
         source=args.source,
         input=args.input,
         hand=args.hand,
@@ -189,6 +190,9 @@ def _prepare(args: argparse.Namespace) -> int:
         limit=args.limit,
         seed=args.seed,
     )
+    counts = library.manifest["quality"]
+    told = ", ".join(f"{count} {status}" for status, count in counts.items())
+    print(f"{library.path}: {told}; reasons and figures: {library.path}/report.csv")
     return 0
 
 

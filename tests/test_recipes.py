@@ -208,10 +208,10 @@ def test_multirun_is_the_product_in_numbered_folders():
     runs = compose_runs("quickstart", ["seed=0,1", "ablation=none,no_future"])
     found = [(r.seed, r.ablation, r.run_dir) for r in runs]
     assert found == [
-        (0, "none", "runs/quickstart/0"),
-        (0, "no_future", "runs/quickstart/1"),
-        (1, "none", "runs/quickstart/2"),
-        (1, "no_future", "runs/quickstart/3"),
+        (0, "none", "runs/quickstart-grid/0"),
+        (0, "no_future", "runs/quickstart-grid/1"),
+        (1, "none", "runs/quickstart-grid/2"),
+        (1, "no_future", "runs/quickstart-grid/3"),
     ]
 
 

@@ -60,11 +60,11 @@ def compose(
 def compose_runs(name_or_path: str | Path, overrides: Sequence[str]) -> list[Recipe]:
     """Compose one recipe for each combination of `key=a,b` (flag -m).
 
-    Each run gets a numbered folder inside `run_dir`, or inside runs/<name>.
+    Each run gets a numbered folder inside `run_dir`, or inside runs/<name>-grid.
     """
     recipes = [compose(name_or_path, run) for run in expand_sweeps(overrides)]
     return [
-        dataclasses.replace(r, run_dir=f"{r.run_dir or f'runs/{r.name}'}/{i}")
+        dataclasses.replace(r, run_dir=f"{r.run_dir or f'runs/{r.name}-grid'}/{i}")
         for i, r in enumerate(recipes)
     ]
 

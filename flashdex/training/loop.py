@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
 from collections.abc import Iterator
@@ -27,6 +28,9 @@ from flashdex.training.learner import Learner
 from flashdex.training.ledger import Conversion, Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.stats import RunningStats
+
+_LOG = logging.getLogger(__name__)
+PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal
 
 
 class Trainer:
@@ -67,6 +71,7 @@ class Trainer:
         self._update_debt = 0.0
         self._vector_steps = 0
         self._start = time.monotonic()
+        self._last_line = self._start
         self._stop = False
         self.conversions: list[Conversion] = []
 
@@ -201,6 +206,16 @@ class Trainer:
         if self.ledger.num_converted:
             note += f", {self.ledger.num_certified} certified"
         bar.set_postfix_str(note)
+        now = time.monotonic()
+        if bar.disable and now - self._last_line >= PLAIN_LOG_S:
+            self._last_line = now
+            _LOG.info(
+                "%d of %d env steps, %s, %.0f s",
+                self.env_steps,
+                self.recipe.total_env_steps,
+                note,
+                self.wall_s,
+            )
 
     def _bar(self) -> tqdm:
         # Without a terminal tqdm would fill the log with carriage returns.

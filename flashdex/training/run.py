@@ -65,6 +65,7 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     recipe = load_run_recipe(run_dir, overrides)
     state = load_checkpoint(run_dir)
     if overrides:
+        write_atomic(run_dir / RECIPE, dump_recipe(recipe))
         (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
     return _train(open_workbench(recipe), run_dir, state)
 

@@ -6,6 +6,7 @@ import dataclasses
 import fnmatch
 import hashlib
 import json
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ from flashdex.motions.library import MotionLibrary
 from flashdex.motions.prepare import prepare
 from flashdex.recipe import Recipe
 from flashdex.training.learner import Learner
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,6 @@ class Workbench:
         """
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
-        if recipe.physics.engine != "cpu":
-            raise FlashdexError(
-                f"physics.engine: '{recipe.physics.engine}' is not part of this "
-                "version, which steps MuJoCo C on the CPU. Use physics=cpu."
-            )
         physics = CpuPhysics(self.library, self.hands, recipe.physics, count)
         return TrackingEnv(
             physics,
@@ -119,6 +117,11 @@ def open_workbench(recipe: Recipe) -> Workbench:
     Raises:
         LibraryError: the library is missing, of another hand or of another rate.
     """
+    if recipe.physics.engine != "cpu":
+        raise FlashdexError(
+            f"physics.engine: '{recipe.physics.engine}' is not part of this version, "
+            "which steps MuJoCo C on the CPU. Use physics=cpu."
+        )
     hands = load_hand(recipe.hand)
     library = select_motions(_load_library(recipe), recipe)
     if library.hand != recipe.hand:
@@ -148,6 +151,7 @@ def _load_library(recipe: Recipe) -> MotionLibrary:
         )
     folder = Path("libraries") / _library_name(recipe)
     if not (folder / "manifest.json").is_file():
+        _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
         prepare(
             source=motions.source,
             input=motions.input,

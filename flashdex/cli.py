@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Waiting threads that spin take the cores from the physics; read by OpenMP when
     # torch is first imported, so it has to stand before every lazy import below.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # likewise, by torchrl
     parser = make_parser()
     args, rest = parser.parse_known_args(argv)
     _take_overrides(parser, args, rest)
@@ -38,7 +39,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         format="%(asctime)s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
         return args.run(args)
     except FlashdexError as error:

@@ -81,7 +81,7 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
                 "state": verdict.state,
                 "errors": {k: round(v, 5) for k, v in verdict.values.items()},
             }
-    rows = {"frozen_object": _score_frozen(bench), **rows}
+    rows["frozen_object"] = _score_frozen(bench)
     if path is not None:
         write_atomic(path, json.dumps(rows, indent=1))
     return Baselines(rows)

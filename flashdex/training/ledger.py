@@ -75,7 +75,6 @@ class Ledger:
         self.conversions: dict[str, Conversion] = {}
         self.last: dict[str, bool] = {}
         self.attempts: dict[str, int] = dict.fromkeys(names, 0)
-        self.best: dict[str, dict[str, float]] = {}
         self._read()
 
     def _read(self) -> None:
@@ -91,10 +90,6 @@ class Ledger:
         name = line["motion"]
         self.attempts[name] = self.attempts.get(name, 0) + 1
         self.last[name] = line["converted"]
-        errors = line["errors"]
-        known = self.best.get(name)
-        if errors and (known is None or _total(errors) < _total(known)):
-            self.best[name] = errors
         if line["converted"] and name not in self.conversions:
             self.conversions[name] = Conversion(
                 name, line["env_steps"], line["wall_s"], line["certified"]
@@ -208,11 +203,6 @@ class Ledger:
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours
         return out
-
-
-def _total(errors: dict[str, float]) -> float:
-    """Position in metres plus rotation, 30 degrees counting as 3 cm."""
-    return errors.get("object_pos", 9.0) + errors.get("object_rot", 9.0) * 0.0573
 
 
 def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempts import AttemptRecorder
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.learner import Learner
-from flashdex.training.ledger import Conversion, Ledger
+from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.stats import RunningStats
 
@@ -73,7 +73,6 @@ class Trainer:
         self._start = time.monotonic()
         self._last_line = self._start
         self._stop = False
-        self.conversions: list[Conversion] = []
 
     @property
     def wall_s(self) -> float:
@@ -150,7 +149,6 @@ class Trainer:
             )
             if converted is not None:
                 self._mark_converted(converted.motion)
-                self.conversions.append(converted)
 
     def _mark_converted(self, name: str) -> None:
         row = self.env.bank.names.index(name)

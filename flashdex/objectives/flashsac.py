@@ -47,6 +47,8 @@ class FlashSACLoss(LossModule):
         target_sigma: sigma of the target entropy per action dimension.
         reward_normalizer: divides the rewards at sampling; None leaves them raw.
         exact_discount: gamma^k of the true window; False is the published gamma^n.
+        own_action_gate: a group's actor loss differentiates its critic with respect to
+            its own action only; False lets the other towers follow that critic too.
 
     Example:
         >>> actor, critic = FlashActor(9, 4, width=16), EnsembleCritic(9, 4, width=16)
@@ -78,6 +80,7 @@ class FlashSACLoss(LossModule):
         target_sigma: float = 0.15,
         reward_normalizer: RewardNormalizer | None = None,
         exact_discount: bool = True,
+        own_action_gate: bool = True,
     ) -> None:
         super().__init__()
         self.out_keys = ["loss_actor", "loss_alpha", "loss_qvalue"]
@@ -94,6 +97,7 @@ class FlashSACLoss(LossModule):
         self.target_qvalue_network = copy.deepcopy(qvalue_network).requires_grad_(False)
         self.reward_normalizer = reward_normalizer
         self.gamma, self.n_steps, self.exact_discount = gamma, n_steps, exact_discount
+        self.own_action_gate = own_action_gate
         self.log_alpha = nn.Parameter(
             torch.full((len(self.groups),), float(alpha_init)).log()
         )
@@ -231,7 +235,12 @@ class FlashSACLoss(LossModule):
     ) -> tuple[Tensor, Metrics]:
         """`actor_loss` of a batch that is already read."""
         return actor_objective(
-            self.actor_network, self.qvalue_network, self.log_alpha, batch, noise
+            self.actor_network,
+            self.qvalue_network,
+            self.log_alpha,
+            batch,
+            noise,
+            own_action_gate=self.own_action_gate,
         )
 
     def qvalue_objective(

@@ -33,6 +33,8 @@ def actor_objective(
     log_alpha: Tensor,
     batch: FlashBatch,
     noise: Tensor,
+    *,
+    own_action_gate: bool = True,
 ) -> tuple[Tensor, Metrics]:
     """``sum_g mean_B [alpha_g log pi_g - min_m Q_gm(s, [a_g, sg(a_other)])]``.
 
@@ -42,6 +44,8 @@ def actor_objective(
         log_alpha: log temperatures, (G,); they receive no gradient.
         batch: sampled transitions.
         noise: standard normal draws, (G, B, A).
+        own_action_gate: False drops the stop-gradient ``sg``, so that every tower
+            climbs the sum of all groups' values.
 
     Returns:
         Loss (), and detached metrics: ``log_prob`` (G, B), all others (G,).
@@ -52,7 +56,8 @@ def actor_objective(
         batch.observation, batch.future, mode="train", keep=slice(0, batch.size)
     )
     action, log_prob = sample_squashed(mean, std, noise)
-    log_p = critic(observation, own_action_views(action), future, mode="frozen")
+    joint = own_action_views(action) if own_action_gate else side_by_side(action)
+    log_p = critic(observation, joint, future, mode="frozen")
     value = critic.expected_value(log_p).amin(1)
     alpha = log_alpha.detach().exp()[:, None]
     loss = masked_mean(alpha * log_prob - value, batch.weight)

@@ -37,6 +37,12 @@ class AlgoConfig:
     """The algorithm."""
     groups: Literal["per_hand", "unified"] = "per_hand"
     """One actor-critic a hand, or one for both with summed reward."""
+    critic_action: Literal["joint", "own"] = "joint"
+    """A hand's critics read the actions of both hands, or its own only; the other hand
+    is then part of the environment."""
+    own_action_gate: bool = True
+    """A hand's actor follows its critics through its own action only; false lets each
+    hand climb the value of the other too. No effect on own-action critics."""
     gamma: float = number(0.98, above=0, high=1)
     """Discount a control step."""
     n_step: int = number(5, low=1)
@@ -96,6 +102,8 @@ class AlgoConfig:
     """Longest repetition of an exploration noise, control steps; 1 = fresh."""
     noise_exponent: float = number(2.0, above=0)
     """Exponent of the repetition lengths; larger repeats less."""
+    noise_clock: Literal["shared", "per_env_hand"] = "shared"
+    """All worlds and hands redraw their noise together, or each by its own clock."""
     compile: bool = False
     """Compile the updates (GPU); slow first minute, then faster."""
 

@@ -68,7 +68,6 @@ class Trainer:
         self.assist_epoch = AssistEpoch()
         self.env_steps = 0
         self.wall_before = 0.0
-        self._update_debt = 0.0
         self._vector_steps = 0
         self._start = time.monotonic()
         self._last_line = self._start
@@ -156,11 +155,7 @@ class Trainer:
         self.env.attempt_sampler.mark_converted(row)
 
     def _learn(self) -> None:
-        if not self.learner.ready:
-            return
-        self._update_debt += self.recipe.algo.updates_per_step
-        while self._update_debt >= 1.0:
-            self._update_debt -= 1.0
+        for _ in range(self.learner.due()):
             with self.stats.time("update"):
                 self.stats.add_update(self.learner.update())
 
@@ -189,11 +184,11 @@ class Trainer:
         record: dict[str, Any] = {
             "env_steps": self.env_steps,
             "hours": self.wall_s / 3600,
-            "updates": self.learner.stepper.updates,
+            "updates": self.learner.updates,
         }
         record.update(self.ledger.metrics(self.wall_s / 3600))
         record.update(self.stats.pop(seconds, self.env.num_envs))
-        record["buffer/rows"] = len(self.learner.buffer)
+        record["buffer/rows"] = self.learner.num_rows
         assist = self.env.assist
         record["assist/level"] = assist.upper[0] if assist is not None else 0.0
         self.log.write(record)
@@ -255,7 +250,6 @@ class Trainer:
             "env_steps": self.env_steps,
             "vector_steps": self._vector_steps,
             "wall_s": self.wall_s,
-            "update_debt": self._update_debt,
             "learner": self.learner.state_dict(),
             "assist": None if assist is None else assist.state_dict(),
             "env_generator": self.env.generator.get_state(),
@@ -268,7 +262,6 @@ class Trainer:
         self.env_steps = state["env_steps"]
         self._vector_steps = state["vector_steps"]
         self.wall_before = state["wall_s"]
-        self._update_debt = state["update_debt"]
         try:
             self.learner.load_state_dict(state["learner"])
         except RuntimeError as error:
@@ -277,8 +270,7 @@ class Trainer:
                 f"networks, the observation or env.num_envs ({error}). Resume without "
                 "it, or start a new run."
             ) from error
-        self.learner.nstep.clear()
-        self.learner.normalizer.clear_returns()
+        self.learner.forget_episodes()
         if self.env.assist is not None and state["assist"] is not None:
             self.env.assist.load_state_dict(state["assist"])
             self.env.redraw_assist()

@@ -26,6 +26,7 @@ from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.prepare import prepare
 from flashdex.recipe import Recipe
+from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner
 
 _LOG = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ class Workbench:
             reference_offset=recipe.env.reference_offset,
         )
         steps = recipe.total_env_steps / env.num_envs
-        return Learner(
+        return FlashSACLearner(
             recipe.algo,
             transforms,
             self.bank,

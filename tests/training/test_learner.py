@@ -13,7 +13,7 @@ GROUPS = ("per_hand", "unified")
 
 
 def parameters(learner):
-    return {k: v.clone() for k, v in learner.loss.state_dict().items()}
+    return {k: v.clone() for k, v in learner.agent.loss.state_dict().items()}
 
 
 @pytest.mark.parametrize("groups", GROUPS)
@@ -35,10 +35,10 @@ def test_act_remember_update(make_bench, collect, groups, future):
             names
         )
         assert all(torch.isfinite(v).all() for v in record.values(True, True))
-    after = learner.loss.state_dict()
+    after = learner.agent.loss.state_dict()
     changed = {k.split(".")[0] for k in before if not torch.equal(before[k], after[k])}
     assert {"actor_network", "qvalue_network", "target_qvalue_network"} <= changed
-    assert learner.stepper.updates == 3
+    assert learner.updates == 3
 
 
 def test_sample_is_what_the_policy_saw(make_bench, collect, bank):
@@ -129,7 +129,7 @@ def test_state_dict_continues_bit_for_bit(make_bench, collect, tmp_path, groups)
     two = bench.make_learner(env)
     two.load_state_dict(through_a_file(one.state_dict(), tmp_path))
     batch = one.sample()
-    a, b = one.stepper.update(batch.clone()), two.stepper.update(batch.clone())
+    a, b = one.agent.update(batch.clone()), two.agent.update(batch.clone())
     assert all(torch.equal(a[k], b[k]) for k in a.keys(True, True))
     ours, theirs = parameters(one), parameters(two)
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)

@@ -1,0 +1,185 @@
+"""FlashSAC on the tracking environment: packed replay around the agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs.transforms import Transform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flashdex import keys
+from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.transforms.base import assemble
+from flashdex.recipe import AlgoConfig
+from flashdex.training.agent import FlashSACAgent
+from flashdex.training.hand_groups import HandGroups
+from flashdex.training.nstep import NStepAssembler
+from flashdex.training.rows import RowCodec
+
+
+class FlashSACLearner:
+    """The paper's learner; see `flashdex.training.learner.Learner` for its contract.
+
+    Args:
+        config: algorithm part of the recipe.
+        transforms: observation transforms in data-flow order.
+        bank: reference frames, for the packed replay rows.
+        example: one compact state, batch (N,), that fixes the network sizes.
+        total_updates: horizon of the learning-rate schedule.
+        seed: of networks, exploration and replay.
+    """
+
+    def __init__(
+        self,
+        config: AlgoConfig,
+        transforms: list[Transform],
+        bank: ReferenceBank,
+        example: TensorDictBase,
+        *,
+        total_updates: int,
+        seed: int,
+    ) -> None:
+        self.config, self.bank = config, bank
+        self.groups = HandGroups.of(bank, unified=config.groups == "unified")
+        self.transforms = transforms
+        self.sample_transforms = [t.clone() for t in transforms]
+        self.generator = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)
+        shown = assemble(transforms, example)
+        future = shown.get(keys.FUTURE, None)
+        self.agent = FlashSACAgent(
+            config,
+            observation_dim=shown[keys.OBSERVATION].shape[-1],
+            future_shape=None if future is None else tuple(future.shape[1:]),
+            action_dim=self.groups.action_dim,
+            groups=self.groups.names,
+            num_envs=example.batch_size[0],
+            total_updates=total_updates,
+            generator=self.generator,
+        )
+        self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
+        self.codec = RowCodec(bank)
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(config.buffer_size), batch_size=config.batch_size
+        )
+        self._debt = 0.0
+
+    @property
+    def ready(self) -> bool:
+        """Whether the replay buffer holds enough rows to learn from."""
+        return len(self.buffer) >= self.config.min_buffer
+
+    @property
+    def updates(self) -> int:
+        """Critic updates performed so far."""
+        return self.agent.stepper.updates
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of the replay buffer."""
+        return len(self.buffer)
+
+    def due(self) -> int:
+        """Updates to perform now; a fraction is carried to the next vector step."""
+        if not self.ready:
+            return 0
+        self._debt += self.config.updates_per_step
+        whole = int(self._debt)
+        self._debt -= whole
+        return whole
+
+    @torch.no_grad()
+    def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
+        """Actions of both hands, (N, 2, J).
+
+        Attempt worlds act deterministically. Before the buffer is ready the other
+        worlds act at random, uniformly, or by the untrained policy.
+
+        Args:
+            state: compact state, batch (N,), with the ``attempt`` flag.
+            explore: False makes every world deterministic.
+        """
+        shown = assemble(self.transforms, state)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            quiet = self.groups.join(self.agent.policy(shown.copy()))
+        if not explore:
+            return quiet
+        # A resumed learner may start with an empty buffer, but not without a policy.
+        trained = self.ready or self.updates > 0
+        if trained or self.config.warmup == "policy":
+            with set_exploration_type(ExplorationType.RANDOM):
+                noisy = self.groups.join(self.agent.policy(shown.copy()))
+        else:
+            noisy = 2 * torch.rand(quiet.shape, generator=self.generator) - 1
+        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), quiet, noisy)
+
+    def remember(
+        self,
+        state: TensorDictBase,
+        action: Tensor,
+        reward: Tensor,
+        next_state: TensorDictBase,
+        terminated: Tensor,
+        done: Tensor,
+    ) -> None:
+        """Update the reward statistics and store what the n-step window yields."""
+        active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
+        self.agent.normalizer.update(
+            self.groups.rewards(reward), done, self.groups.mask(active)
+        )
+        row = self.nstep.push(
+            state.select(*keys.STATE),
+            action,
+            reward,
+            next_state.select(*keys.STATE),
+            terminated,
+            done,
+        )
+        if row is not None:
+            self.buffer.extend(self.codec.pack(row))
+
+    def sample(self) -> TensorDict:
+        """A replay sample, assembled: what the loss reads, batch (B,)."""
+        state, transition = self.codec.unpack(self.buffer.sample())
+        shown = assemble(self.sample_transforms, state)
+        size = transition.batch_size[0]
+        wanted = [keys.OBSERVATION, keys.GROUP_MASK]
+        if shown.get(keys.FUTURE, None) is not None:
+            wanted.append(keys.FUTURE)
+        now, after = shown.select(*wanted).split(size)
+        after = after.set(keys.TERMINATED, transition[keys.TERMINATED])
+        batch = now.set("next", after).set(keys.STEPS, transition[keys.STEPS])
+        batch.set(keys.GROUP_MASK, self.groups.mask(batch[keys.GROUP_MASK]))
+        reward = self.groups.rewards(transition[keys.REWARD])
+        actions = self.groups.actions(transition[keys.ACTION])
+        for i, group in enumerate(self.groups.names):
+            batch.set((group, keys.ACTION), actions[i])
+            batch.set(("next", group, keys.REWARD), reward[:, i : i + 1])
+        return batch
+
+    def update(self) -> TensorDict:
+        """One FlashSAC update on a fresh sample; returns its metrics."""
+        return self.agent.update(self.sample())
+
+    def forget_episodes(self) -> None:
+        """Drop the open n-step window and the running returns."""
+        self.nstep.clear()
+        self.agent.normalizer.clear_returns()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Agent, n-step tail and update debt; the replay rows are not part of it."""
+        return {
+            "agent": self.agent.state_dict(),
+            "nstep": self.nstep.state_dict(),
+            "debt": self._debt,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore ``state_dict``."""
+        self.agent.load_state_dict(state["agent"])
+        self.nstep.load_state_dict(state["nstep"])
+        self._debt = state["debt"]

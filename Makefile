@@ -14,7 +14,7 @@ help:
 	@echo "make quickstart  train four small motions on the CPU, minutes"
 	@echo "make test        tests (no GPU, no data, no network)"
 	@echo "make check       lint, format, types, recipes, links"
-	@echo "make bench       environment steps per second, as JSON; learning and slow tests"
+	@echo "make bench       environment and learner speed, as JSON; learning and slow tests"
 	@echo "make docs        check the links of the pages"
 	@echo "make clean       remove what was made, runs excepted"
 
@@ -62,6 +62,7 @@ check: $(DEV)
 bench: $(DEV)
 	$(BIN)/flashdex bench env --num-envs 64
 	$(BIN)/flashdex bench env --num-envs 512
+	$(BIN)/flashdex bench learner
 	$(BIN)/python -m pytest -m "learn or slow"
 
 docs: $(CORE)

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.envs.transforms import blocks
-from flashdex.recipe import EnvConfig, Recipe
+from flashdex.recipe import EnvConfig, GymConfig, GymRecipe, LoopConfig, Recipe
 from flashdex.recipe.options import REGISTRY, NoOptions
-from flashdex.recipe.schema import Expectation
+from flashdex.recipe.schema import Expectation, RunRecipe
 
 PAGE = Path(__file__).parent / "options.md"
 HEAD = """# Every option
@@ -25,6 +25,8 @@ recipe is put together stands on the page [recipes](recipes.md).
 
 Metres, radians, seconds, kilograms, unless a unit is given.
 """
+GYM_NOTE = """With `task: gym` a recipe trains on a stock environment instead of
+motions ([page](gym.md))."""
 NAMED_NOTES = {
     "transforms": "Observation blocks by name. `null` takes one out of a recipe,\n"
     "`~env.transforms.NAME` does so on the command line.",
@@ -41,9 +43,12 @@ def plain(text: str) -> str:
 
 def field_docs(cls: type) -> dict[str, str]:
     """Return the docstring below each field of a dataclass, in one line each."""
+    found: dict[str, str] = {}
+    for base in cls.__bases__:
+        if dataclasses.is_dataclass(base):
+            found |= field_docs(base)
     tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     assert isinstance(tree, ast.ClassDef)
-    found = {}
     for field, text in zip(tree.body, tree.body[1:], strict=False):
         is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
         if isinstance(field, ast.AnnAssign) and is_text:
@@ -79,6 +84,8 @@ def default(field: dataclasses.Field[Any]) -> str:
         return "must be given"
     else:
         value = field.default
+    if value == "":
+        return "empty"
     if value is None or isinstance(value, bool):
         return f"`{str(value).lower() if value is not None else 'null'}`"
     if isinstance(value, int):
@@ -115,7 +122,10 @@ def section(path: str, cls: type, *, about: str = "") -> list[str]:
     for part in intro:
         lines += [part, ""]
     lines += [*table(cls), ""]
-    for name, hint in typing.get_type_hints(cls).items():
+    hints = typing.get_type_hints(cls)
+    shared = {field.name for field in dataclasses.fields(RunRecipe)}
+    for name in sorted(hints, key=lambda name: name in shared):  # those come last
+        hint = hints[name]
         where = f"{path}.{name}" if path else name
         for kind in (hint, *typing.get_args(hint)):
             if dataclasses.is_dataclass(kind) and kind is not Expectation:
@@ -138,10 +148,21 @@ def named_section(path: str, kind: str) -> list[str]:
     return lines
 
 
+def gym_sections() -> list[str]:
+    """Return what a recipe for a stock environment has of its own."""
+    loop = ", ".join(f"`{field.name}`" for field in dataclasses.fields(LoopConfig))
+    note = (
+        "`algo`, `logger` and `expect` are the same as above, but for the keys that "
+        f"speak of hands. `train` has {loop}. The other groups do not exist there."
+    )
+    head = ["## The gym recipe", "", plain(GYM_NOTE), "", *table(GymRecipe), ""]
+    return [*head, note, "", *section("gym", GymConfig)]
+
+
 def render() -> str:
     """Return the whole page."""
     expect = ["## expect", "", "A list; each entry promises one number.", ""]
-    lines = [*section("", Recipe), *expect, *table(Expectation)]
+    lines = [*section("", Recipe), *expect, *table(Expectation), "", *gym_sections()]
     return HEAD + "\n" + "\n".join(lines).rstrip() + "\n"
 
 

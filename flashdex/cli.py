@@ -141,7 +141,7 @@ def _add_run_verbs(
     verb.add_argument("run_dir", type=Path, metavar="RUN")
 
     verb = add("bench", _bench, "measure; prints JSON")
-    verb.add_argument("what", choices=["env"], help="what to measure")
+    verb.add_argument("what", choices=["env", "learner"], help="what to measure")
     verb.add_argument(
         "words", nargs=argparse.REMAINDER, help="options of it; try: bench env --help"
     )
@@ -200,7 +200,7 @@ def _train(args: argparse.Namespace) -> int:
     from flashdex.recipe import compose, compose_runs, dump_recipe
 
     if args.resume is not None:
-        from flashdex.training.run import resume
+        from flashdex.training.any_run import resume
 
         first = [args.recipe] if args.recipe else []
         _show_run(resume(args.resume, first + args.overrides))
@@ -214,22 +214,34 @@ def _train(args: argparse.Namespace) -> int:
     if args.cfg:
         print("---\n".join(dump_recipe(recipe) for recipe in recipes), end="")
         return 0
-    from flashdex.training.run import train
+    from flashdex.training.any_run import train
 
     for recipe in recipes:
-        _show_run(train(recipe))
+        if not _show_run(train(recipe)):
+            break
     return 0
 
 
-def _show_run(run_dir: Path) -> None:
-    from flashdex.viz.report import write_report
-    from flashdex.viz.table import run_table
+def _show_run(run_dir: Path) -> bool:
+    """Show what a run came to; False when a signal ended it, which is no time to."""
+    from flashdex.training.sessions import SIGNAL, ended_by
+    from flashdex.viz.summary import run_summary
 
-    print(run_table(run_dir))
-    print(f"\nreport: {write_report(run_dir)}")
+    if ended_by(run_dir) == SIGNAL:
+        print(f"stopped; go on with: flashdex train --resume {run_dir}")
+        return False
+    print(run_summary(run_dir))
+    return True
 
 
 def _evaluate(args: argparse.Namespace) -> int:
+    from flashdex.recipe import task_of_run
+
+    if task_of_run(args.run_dir) == "gym":
+        from flashdex.training.gym_run import evaluate_gym
+
+        print(json.dumps(evaluate_gym(args.run_dir, args.overrides), indent=1))
+        return 0
     from flashdex.training.evaluate import evaluate
     from flashdex.viz.table import evaluation_table
 
@@ -239,9 +251,11 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    from flashdex.recipe import require_motions
     from flashdex.training.replay_run import replay
     from flashdex.viz.table import replay_line
 
+    require_motions(args.run_dir)
     replayed = replay(args.run_dir)
     for one in replayed:
         print(replay_line(one.motion, one.stored, one.found, holds=one.holds))
@@ -266,16 +280,18 @@ def _score(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
+    from flashdex.recipe import require_motions
     from flashdex.viz.report import write_report
 
+    require_motions(args.run_dir)
     print(write_report(args.run_dir))
     return 0
 
 
 def _bench(args: argparse.Namespace) -> int:
-    from flashdex.bench.env import main as bench_env
+    from flashdex.bench import env, learner
 
-    bench_env(args.words)
+    {"env": env.main, "learner": learner.main}[args.what](args.words)
     return 0
 
 

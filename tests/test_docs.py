@@ -64,10 +64,12 @@ def run_tiny(library, tmp_path_factory):
         MotionsConfig,
         PhysicsConfig,
     )
+    from flashdex.recipe.ppo import PPOConfig
     from flashdex.training.run import train
 
-    def run(groups):
-        folder = tmp_path_factory.mktemp("runs") / groups
+    def run(groups, kind="flashsac"):
+        folder = tmp_path_factory.mktemp("runs") / f"{groups}-{kind}"
+        ppo = PPOConfig(horizon=20, hidden=[16])
         env = EnvConfig()
         recipe = Recipe(
             name="tiny",
@@ -83,7 +85,9 @@ def run_tiny(library, tmp_path_factory):
                 rewards={**env.rewards, "object_pose": {}},
                 assist=AssistConfig(enabled=True),
             ),
-            algo=AlgoConfig(groups=groups, updates_per_step=0.2, **SIZES),
+            algo=AlgoConfig(
+                kind=kind, groups=groups, updates_per_step=0.2, ppo=ppo, **SIZES
+            ),
             train=TrainConfig(certify=False),
         )
         return train(validate(recipe))
@@ -125,6 +129,7 @@ def test_every_link_leads_somewhere():
 def test_glossary_names_exactly_the_logged_keys(tiny_run, run_tiny):
     logged = logged_keys(tiny_run) | logged_keys(run_tiny("unified"))
     assert any(key.startswith("loss/both/") for key in logged)
+    logged |= logged_keys(run_tiny("per_hand", "ppo"))
     assert {general(key) for key in logged} == first_cells("metrics.md", "Glossary")
 
 

@@ -44,6 +44,7 @@ OPTIONAL = {
     "viser": {"viz/viewer.py", "viz/page.py"},
     "mjviser": {"viz/viewer.py", "viz/page.py"},
     "ray": {"training/distributed.py"},
+    "gymnasium": {"training/gym.py"},
     "h5py": {"export/robomimic.py"},
     "pyarrow": {"export/lerobot.py"},
 }

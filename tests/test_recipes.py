@@ -15,6 +15,8 @@ from flashdex.hands.gains import GainsPreset
 from flashdex.metrics.criteria_table import criterion_names
 from flashdex.recipe import (
     CRITERIA,
+    GymConfig,
+    GymRecipe,
     MotionsConfig,
     PhysicsConfig,
     Recipe,
@@ -228,8 +230,10 @@ def leaves(data, path=()):
 
 def default_of(path):
     """Look a path up in the schema's defaults, options of named parts included."""
-    motions = MotionsConfig(source="procedural")
-    recipe = validate(Recipe(name="", total_env_steps=10**9, motions=motions))
+    recipe = GymRecipe(name="", total_env_steps=10**9, gym=GymConfig(env_id="Any-v0"))
+    if path[0] != "gym":
+        motions = MotionsConfig(source="procedural")
+        recipe = validate(Recipe(name="", total_env_steps=10**9, motions=motions))
     node = dataclasses.asdict(recipe)
     for key in path:
         node = node.get(key, None) if isinstance(node, dict) else None
@@ -253,6 +257,7 @@ def test_no_recipe_repeats_a_default(file):
 
 def test_the_default_check_can_fail():
     assert default_of(("algo", "gamma")) == 0.98
+    assert default_of(("gym", "num_envs")) == 1
     assert default_of(("env", "rewards", "object_points", "rho")) == 0.058
     assert list(leaves({"a": {"b": 1}, "defaults": [1]})) == [(("a", "b"), 1)]
 

@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -24,9 +21,10 @@ from mujoco.batch import Batch
 from tensordict import TensorDictBase
 
 from flashdex import keys
+from flashdex.bench.machine import describe_commit, describe_hardware
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.recipe import compose
+from flashdex.recipe import Recipe, compose, expect_kind
 from flashdex.training.setup import open_workbench
 
 SEGMENT = 10  # control steps by which the two take turns, from equal states
@@ -143,7 +141,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     overrides = list(args.overrides)
     if args.num_envs is not None:
         overrides.append(f"env.num_envs={args.num_envs}")
-    recipe = compose(args.recipe, overrides)
+    recipe = expect_kind(compose(args.recipe, overrides), Recipe, where="bench env")
     env = open_workbench(recipe).make_env()
     threads = recipe.physics.num_threads
     result = {
@@ -168,30 +166,3 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="always so")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
     return parser.parse_intermixed_args(words)
-
-
-def describe_hardware() -> str:
-    """Processor and number of cores."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        lines = info.read_text(encoding="utf-8").splitlines()
-        models = [
-            x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")
-        ]
-        name = models[0] if models else name
-    return f"{name}, {torch.multiprocessing.cpu_count()} cores"
-
-
-def describe_commit() -> str:
-    """Commit of the source tree, ``+`` when it was changed; empty outside of git."""
-    folder = Path(__file__).parent
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], cwd=folder, capture_output=True, text=True, check=False
-        )
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    commit = git("rev-parse", "--short", "HEAD")
-    return commit + ("+" if commit and git("status", "--porcelain", "-uno") else "")

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from flashdex.modules.future import FutureEncoder
 from flashdex.modules.layers import Mode, UnitLinear
+from flashdex.modules.product import product
 from flashdex.modules.trunk import FlashTrunk
 
 Head = Literal["centred", "unit"]
@@ -136,4 +137,4 @@ class PlainLinear(nn.Module):
     def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
         """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
         weight = self.weight.detach() if mode == "frozen" else self.weight
-        return torch.bmm(x, weight.mT)
+        return product(x, weight)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from flashdex.modules.layers import Mode, UnitBatchNorm, UnitLinear
+from flashdex.modules.product import product
 
 
 class InputEmbed(nn.Module):
@@ -37,11 +37,13 @@ class InputEmbed(nn.Module):
         column_mask: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.norm = UnitBatchNorm(in_features, ensemble=ensemble)
+        live = None if column_mask is None else int(column_mask[0].sum())
+        self.norm = UnitBatchNorm(in_features, ensemble=ensemble, live=live)
         self.linear = UnitLinear(in_features, width, ensemble=ensemble)
         self.register_buffer("column_mask", column_mask, persistent=False)
         if column_mask is not None:
             with torch.no_grad():
+                self.norm.weight.mul_(column_mask)
                 self.linear.weight.mul_(column_mask[:, None])
             self.linear.project_()
 
@@ -63,8 +65,10 @@ class InputEmbed(nn.Module):
         weight = self.linear.parameter(mode)
         if self.column_mask is not None:
             scale, shift = scale * self.column_mask, shift * self.column_mask
-        bias = torch.bmm(weight, shift.unsqueeze(-1)).squeeze(-1)
-        folded = (weight * scale[:, None]).split([p.shape[-1] for p in parts], -1)
+        bias = product(shift.unsqueeze(1), weight).squeeze(1)
+        widths = [part.shape[-1] for part in parts]
+        columns = zip(weight.split(widths, -1), scale.split(widths, -1), strict=True)
+        folded = [w * s[:, None] for w, s in columns]
         return _sum_of_products(centred, folded, bias)
 
     def _batch_normalise(
@@ -106,16 +110,14 @@ def _sum_of_products(
     shared: Tensor | None = None
     for part, weight in zip(parts, weights, strict=True):
         if part.dim() == 2:
-            flat = weight.reshape(ensemble * width, -1)
-            shared = (
-                linear(part, flat, bias.reshape(-1))
-                if shared is None
-                else torch.addmm(shared, part, flat.mT)
-            )
+            flat = weight.reshape(1, ensemble * width, -1)
+            offset = bias.reshape(1, -1) if shared is None else None
+            one = product(part.unsqueeze(0), flat, offset).squeeze(0)
+            shared = one if shared is None else shared + one
     out = bias[:, None]
     if shared is not None:
-        out = shared.unflatten(-1, (ensemble, width)).transpose(0, 1)
+        out = shared.unflatten(-1, (ensemble, width)).transpose(0, 1).contiguous()
     for part, weight in zip(parts, weights, strict=True):
         if part.dim() == 3:
-            out = torch.baddbmm(out, part, weight.mT)
+            out = out + product(part, weight)
     return out

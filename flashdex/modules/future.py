@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear, silu
+from torch.nn.functional import silu
 
 from flashdex.modules.layers import Mode
+from flashdex.modules.product import product
 
 KERNELS = (1, 4, 2)
 STRIDES = (1, 2, 1)
@@ -75,15 +76,40 @@ class FutureEncoder(nn.Module):
                 [w.detach() for w in weights],
                 [b.detach() for b in biases],
             )
-        batch = future.shape[0]
-        # frames before channels: each convolution is one product over its window
-        x = linear(future.mT, weights[0].flatten(0, 1), biases[0].flatten())
-        x = silu(x).unflatten(-1, (self.ensemble, -1)).movedim(2, 0)
+        # frames before channels: each convolution is one product
+        frames = future.mT.flatten(0, 1).unsqueeze(0)
+        x = product(frames, weights[0].flatten(0, 1)[None], biases[0].flatten()[None])
+        x = x.view(len(future), -1, self.ensemble, x.shape[-1] // self.ensemble)
+        x = silu(x.movedim(2, 0).contiguous())
         for i in (1, 2):
-            windows = x.unfold(2, KERNELS[i], STRIDES[i])
-            length = windows.shape[2]
-            flat = windows.reshape(self.ensemble, batch * length, -1)
-            x = silu(torch.baddbmm(biases[i][:, None], flat, weights[i].mT))
-            x = x.unflatten(1, (batch, length))
-        flat = x.flatten(2)
-        return torch.baddbmm(biases[3][:, None], flat, weights[3].mT)
+            x = silu(_convolve(x, weights[i], biases[i], stride=STRIDES[i]))
+        return product(x.flatten(2), weights[3], biases[3])
+
+
+def _convolve(x: Tensor, weight: Tensor, bias: Tensor, *, stride: int) -> Tensor:
+    """Convolution over frames: every frame group times every tap, then a shifted sum.
+
+    Groups of ``stride`` frames do not overlap, so no window has to be copied out.
+
+    Args:
+        x: (E, B, K, C).
+        weight: (E, d, C kernel), the kernel a multiple of ``stride``.
+        bias: (E, d).
+        stride: frames between two windows.
+
+    Returns:
+        (E, B, (K - kernel) // stride + 1, d).
+    """
+    ensemble, batch, frames, channels = x.shape
+    groups = frames // stride
+    x = x[:, :, : groups * stride].reshape(ensemble, batch * groups, -1)
+    # one row per tap and output, over the frames and channels of a group
+    taps = weight.shape[-1] // (stride * channels)
+    rows = weight.unflatten(-1, (channels, taps, stride)).permute(0, 3, 1, 4, 2)
+    rows = rows.flatten(3).flatten(1, 2)
+    parts = product(x, rows).view(ensemble, batch, groups, taps, -1)
+    length = groups - taps + 1
+    out = bias[:, None, None] + parts[:, :, :length, 0]
+    for tap in range(1, taps):
+        out = out + parts[:, :, tap : tap + length, tap]
+    return out

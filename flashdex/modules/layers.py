@@ -12,7 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from flashdex.modules.batchnorm import batch_norm_relu
+from flashdex.modules.dense import linear_norm_relu
+from flashdex.modules.product import product
 
 Mode = Literal["train", "eval", "frozen"]
 """How a forward pass treats statistics and parameters.
@@ -56,7 +57,7 @@ class UnitLinear(nn.Module):
 
     def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
         """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
-        return torch.bmm(x, self.parameter(mode).mT)
+        return product(x, self.parameter(mode))
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -88,15 +89,16 @@ def dense_relu(
         (E, rows, out_features).
     """
     if mode == "train":
-        y = linear(x)
         gamma, beta = norm.affine(mode)
-        out, mean, var = batch_norm_relu(y, gamma, beta, eps=norm.eps, keep=keep)
+        out, mean, var = linear_norm_relu(
+            x, linear.parameter(mode), gamma, beta, eps=norm.eps, keep=keep
+        )
         norm.track_(mean, var, x.shape[1])
         return out
     scale, shift = norm.running_affine(mode)
     weight = linear.parameter(mode) * scale.unsqueeze(-1)
     x = x if keep is None else x[:, keep]
-    return torch.baddbmm(shift[:, None], x, weight.mT).relu_()
+    return product(x, weight, shift, relu=True)
 
 
 class UnitBatchNorm(nn.Module):
@@ -106,13 +108,20 @@ class UnitBatchNorm(nn.Module):
     0.01, eps 1e-5. Statistics are kept per ensemble member. The layer holds state and
     projection; `dense_relu` and `InputEmbed` apply it fused with their products.
 
+    The published statistics start at mean 0 and variance 1 and forget that over some
+    hundred updates: a feature of 2 cm is shrunk thirtyfold until then. With ``warmup``
+    they are the plain mean of all updates so far until the momentum takes over.
+
     Args:
         features: size d of the last axis.
         ensemble: number of members E.
+        live: columns that are not masked, all of them by default; masked ones have
+            gamma and beta zero and no part in the joint norm.
     """
 
     running_mean: Tensor
     running_var: Tensor
+    num_tracked: Tensor
 
     def __init__(
         self,
@@ -121,14 +130,18 @@ class UnitBatchNorm(nn.Module):
         ensemble: int = 1,
         momentum: float = 0.01,
         eps: float = 1e-5,
+        live: int | None = None,
     ) -> None:
         super().__init__()
         self.momentum = momentum
         self.eps = eps
+        self.warmup = False
+        self.live = features if live is None else live
         self.weight = nn.Parameter(torch.ones(ensemble, features))
         self.bias = nn.Parameter(torch.zeros(ensemble, features))
         self.register_buffer("running_mean", torch.zeros(ensemble, features))
         self.register_buffer("running_var", torch.ones(ensemble, features))
+        self.register_buffer("num_tracked", torch.zeros(ensemble, 1))
 
     def affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
         """Gamma and beta, (E, d) each; without gradient when ``mode`` is frozen."""
@@ -147,8 +160,12 @@ class UnitBatchNorm(nn.Module):
         """
         unbiased = var.detach() * (count / max(count - 1, 1))
         mean = mean.detach().expand_as(self.running_mean)
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(unbiased.expand_as(self.running_var), self.momentum)
+        rate: Tensor | float = self.momentum
+        if self.warmup:
+            self.num_tracked += 1
+            rate = self.num_tracked.reciprocal().clamp_min(self.momentum).to(mean.dtype)
+        self.running_mean.lerp_(mean, rate)
+        self.running_var.lerp_(unbiased.expand_as(self.running_var), rate)
 
     def running_affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
         """``scale, shift`` (E, d) of the running form ``y = scale x + shift``."""
@@ -160,7 +177,7 @@ class UnitBatchNorm(nn.Module):
     def project_(self) -> None:
         """Scale gamma and beta together so that their joint norm is sqrt(d)."""
         square = self.weight.square().sum(-1, True) + self.bias.square().sum(-1, True)
-        scale = self.weight.shape[-1] ** 0.5 * torch.rsqrt(square + NORM_EPS)
+        scale = self.live**0.5 * torch.rsqrt(square + NORM_EPS)
         self.weight.mul_(scale)
         self.bias.mul_(scale)
 
@@ -196,3 +213,10 @@ def project_(module: nn.Module) -> None:
     for layer in module.modules():
         if isinstance(layer, UnitLinear | UnitBatchNorm | UnitRMSNorm):
             layer.project_()
+
+
+def warm_up_statistics(module: nn.Module) -> None:
+    """Start the running statistics of every `UnitBatchNorm` inside ``module`` fresh."""
+    for layer in module.modules():
+        if isinstance(layer, UnitBatchNorm):
+            layer.warmup = True

@@ -54,8 +54,16 @@ def nested(group: str | None, key: NestedKey) -> NestedKey:
 
 def read_pair(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """Entry at t and at t + k, one after the other: (2B, ...)."""
-    following = ("next", key) if isinstance(key, str) else ("next", *key)
-    return torch.cat([tensordict.get(key), tensordict.get(following)])
+    return torch.cat([tensordict.get(key), tensordict.get(nested("next", key))])
+
+
+def read_windows(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Windows (B, C, K) at t and at t + k, (2B, C, K), each frame's channels adjacent.
+
+    The encoders read frames before channels; one copy here spares one in each of them.
+    """
+    ends = tensordict.get(key), tensordict.get(nested("next", key))
+    return torch.cat([end.mT for end in ends]).mT
 
 
 def masked_mean(values: Tensor, weight: Tensor | None) -> Tensor:

@@ -15,7 +15,13 @@ from torchrl.objectives import LossModule
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.squash import target_entropy
-from flashdex.objectives.batch import FlashBatch, nested, read_pair, stack_groups
+from flashdex.objectives.batch import (
+    FlashBatch,
+    nested,
+    read_pair,
+    read_windows,
+    stack_groups,
+)
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.objectives.terms import (
     Metrics,
@@ -142,7 +148,7 @@ class FlashSACLoss(LossModule):
     def read(self, tensordict: TensorDictBase) -> FlashBatch:
         """Stack the groups of a sampled batch and scale its rewards."""
         keys, following = self.tensor_keys, tensordict.get("next")
-        future = read_pair(tensordict, keys.future) if self._reads_future else None
+        future = read_windows(tensordict, keys.future) if self._reads_future else None
         reward = stack_groups(following, self.groups, keys.reward)
         if self.reward_normalizer is not None:
             reward = reward / self.reward_normalizer.denominator().to(reward.dtype)

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from flashdex.modules.layers import project_
+from flashdex.modules.product import bfloat16_products
 from flashdex.objectives.batch import FlashBatch, nested
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.optim import ScheduledAdam, TargetAverage
@@ -34,6 +35,7 @@ class FlashSACStepper:
         tau: rate of the target average.
         generator: source of the policy noise; None is the global one.
         compile: compile the two objectives.
+        autocast: large matrix products in bfloat16, everything else in float32.
 
     Example:
         >>> stepper = FlashSACStepper(loss, total_updates=10_000)
@@ -53,8 +55,10 @@ class FlashSACStepper:
         tau: float = 0.01,
         generator: torch.Generator | None = None,
         compile: bool = False,
+        autocast: bool = False,
     ) -> None:
         self.loss = loss
+        self.autocast = autocast
         self.actor_period, self.actor_delay = actor_period, actor_delay
         self.generator = generator
         self.updates = 0
@@ -98,12 +102,13 @@ class FlashSACStepper:
         """
         batch = self.loss.read(tensordict)
         waited = self.updates >= self.actor_delay
-        if waited and self.updates % self.actor_period == 0:
-            self._actor_step(batch, self._draw(batch, actor_noise))
-        noise = self._draw(batch, target_noise)
-        qvalue, critic_metrics = self._qvalue_objective(batch, noise)
         rate = self.critic_optimizer.rate
-        self.critic_optimizer.step(qvalue)
+        with bfloat16_products(self.autocast):
+            if waited and self.updates % self.actor_period == 0:
+                self._actor_step(batch, self._draw(batch, actor_noise))
+            noise = self._draw(batch, target_noise)
+            qvalue, critic_metrics = self._qvalue_objective(batch, noise)
+            self.critic_optimizer.step(qvalue)
         project_(self.loss.qvalue_network)
         self.target_average.step()
         self.updates += 1

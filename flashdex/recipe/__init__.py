@@ -5,6 +5,7 @@ from flashdex.recipe.algo import (
     AlgoConfig,
     Criterion,
     LoggerConfig,
+    LoopConfig,
     TrainConfig,
 )
 from flashdex.recipe.check import validate
@@ -23,13 +24,15 @@ from flashdex.recipe.env import (
     PhysicsConfig,
     ResetNoise,
 )
+from flashdex.recipe.gym import GymConfig, GymRecipe
+from flashdex.recipe.kinds import expect_kind, require_motions, task_of_run
 from flashdex.recipe.options import (
     REWARDS,
     TERMINATIONS,
     TRANSFORMS,
     build_options,
 )
-from flashdex.recipe.schema import Expectation, Recipe
+from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import copy_recipe, find_recipe, list_recipes
 
 __all__ = [
@@ -42,21 +45,28 @@ __all__ = [
     "Criterion",
     "EnvConfig",
     "Expectation",
+    "GymConfig",
+    "GymRecipe",
     "LoggerConfig",
+    "LoopConfig",
     "MotionsConfig",
     "PhysicsConfig",
     "Recipe",
     "ResetNoise",
+    "RunRecipe",
     "TrainConfig",
     "build_options",
     "compose",
     "compose_runs",
     "copy_recipe",
     "dump_recipe",
+    "expect_kind",
     "find_recipe",
     "inspect_recipe",
     "list_recipes",
     "load_recipe",
     "override_recipe",
+    "require_motions",
+    "task_of_run",
     "validate",
 ]

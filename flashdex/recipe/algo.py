@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from flashdex.recipe.fields import number
+from flashdex.recipe.ppo import PPOConfig
 
 Criterion = Literal[
     "sr_mt_obj",
@@ -31,10 +32,10 @@ CRITERIA: tuple[str, ...] = get_args(Criterion)
 
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig:
-    """FlashSAC over groups of action dimensions."""
+    """FlashSAC over groups of action dimensions, or the PPO baseline."""
 
-    kind: Literal["flashsac"] = "flashsac"
-    """The algorithm."""
+    kind: Literal["flashsac", "ppo"] = "flashsac"
+    """The algorithm; ppo is the paper's baseline and reads `algo.ppo`."""
     groups: Literal["per_hand", "unified"] = "per_hand"
     """One actor-critic a hand, or one for both with summed reward."""
     critic_action: Literal["joint", "own"] = "joint"
@@ -92,6 +93,10 @@ class AlgoConfig:
     """Standard deviation of the policy at the start (centred head)."""
     head: Literal["centred", "unit"] = "centred"
     """centred starts at mean 0, on the reference; unit is FlashSAC's own."""
+    norm_warmup: bool = False
+    """BatchNorm statistics start as plain means of the updates so far; false is as
+    published (mean 0, variance 1, forgotten over hundreds of updates), which a run of
+    few updates never recovers from."""
     future_latent: int = number(128, low=1)
     """Width of the encoded future window."""
     future_channels: list[int] = dataclasses.field(
@@ -106,25 +111,36 @@ class AlgoConfig:
     """All worlds and hands redraw their noise together, or each by its own clock."""
     compile: bool = False
     """Compile the updates (GPU); slow first minute, then faster."""
+    ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    """Numbers of the PPO baseline."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """The loop around the updates: checkpoints, logs, criterion, end."""
+class LoopConfig:
+    """The loop around the updates: checkpoints, logs, end."""
 
     checkpoint_every_s: float = number(300.0, above=0)
     """Seconds between checkpoints."""
     keep_checkpoints: int = number(3, low=1)
     """Newest checkpoints kept."""
+    checkpoint_replay: bool = False
+    """Store new replay rows beside each checkpoint, so that a resumed run learns on at
+    once: the disk holds the whole buffer, about 1 kB a row."""
     log_every_s: float = number(5.0, above=0)
     """Seconds between log records."""
     wall_limit_s: float | None = number(None, above=0)
     """Stop cleanly after this many seconds; null = never."""
-    stop_when_all_converted: bool = True
-    """Stop once every motion is converted."""
     torch_threads: int = number(0, low=0)
     """Threads of the learner on a CPU; 0 = torch's choice. With small networks more
     threads wait for each other longer than they compute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(LoopConfig):
+    """The loop around the updates: checkpoints, logs, criterion, end."""
+
+    stop_when_all_converted: bool = True
+    """Stop once every motion is converted."""
     criterion: Criterion = "sr_mt_obj"
     """What counts as a conversion (see docs on criteria)."""
     certify: bool = True

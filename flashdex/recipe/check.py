@@ -10,35 +10,38 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from flashdex.errors import RecipeError, nearest
 from flashdex.recipe.fields import range_problem
+from flashdex.recipe.kinds import split_foreign
 from flashdex.recipe.options import REGISTRY, Kind
-from flashdex.recipe.relations import find_conflicts
-from flashdex.recipe.schema import Recipe
+from flashdex.recipe.schema import RunRecipe
 
+R = TypeVar("R", bound=RunRecipe)
 _NAMED: dict[str, Kind] = {f"env.{kind}": kind for kind in REGISTRY}
 # Stand-ins for required values that are absent; the recipe is refused anyway.
 _STAND_INS: dict[type, Any] = {int: 1, str: "", float: 1.0}
 
 
-def read_recipe(data: Mapping[str, Any]) -> tuple[Recipe, list[str]]:
+def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
     """Turn a plain mapping into a recipe and list every problem in it.
 
     Args:
-        data: the composed recipe; keys that are absent take their default.
+        data: the composed recipe, its kind by ``task``; keys that are absent take
+            their default.
 
     Returns:
         The recipe (unusable when there are problems) and the problems, each with its
         YAML path.
     """
     problems: list[str] = []
-    recipe = _read_dataclass(Recipe, data, "", problems)
-    return recipe, problems + find_conflicts(recipe)
+    kind, own = split_foreign(data, problems)
+    recipe = _read_dataclass(kind.root, own, "", problems)
+    return recipe, problems + kind.find_conflicts(recipe)
 
 
-def validate(recipe: Recipe) -> Recipe:
+def validate(recipe: R) -> R:
     """Check a recipe that was built in Python; all problems raise one RecipeError.
 
     Returns:
@@ -47,7 +50,7 @@ def validate(recipe: Recipe) -> Recipe:
     complete, problems = read_recipe(dataclasses.asdict(recipe))
     if problems:
         raise RecipeError(problems, where=recipe.name)
-    return complete
+    return typing.cast(R, complete)
 
 
 def _join(path: str, key: object) -> str:

@@ -1,4 +1,4 @@
-"""From a recipe's name and overrides to a checked `Recipe`.
+"""From a recipe's name and overrides to a checked recipe.
 
 Hydra merges the files (defaults list, groups, ablations); values, defaults and names
 are then checked here against the dataclasses, because Hydra would stop at the first
@@ -21,7 +21,7 @@ from yaml import YAMLError
 from flashdex.errors import FlashdexError, RecipeError
 from flashdex.recipe.check import read_recipe
 from flashdex.recipe.defaults import check_defaults, known_groups
-from flashdex.recipe.options import REGISTRY, default_mapping
+from flashdex.recipe.kinds import kind_of, mark_groups
 from flashdex.recipe.overrides import (
     apply_values,
     choose_groups,
@@ -29,14 +29,14 @@ from flashdex.recipe.overrides import (
     hydra_choices,
     parse_overrides,
 )
-from flashdex.recipe.schema import Recipe
+from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.store import find_recipe, search_dirs
 
 
 def compose(
     name_or_path: str | Path,
     overrides: Sequence[str] = (),
-) -> Recipe:
+) -> RunRecipe:
     """Compose a recipe; every mistake in it is reported at once.
 
     Args:
@@ -48,7 +48,7 @@ def compose(
         RecipeError: with all problems, each with its YAML path.
 
     Example:
-        >>> compose("quickstart", ["env.num_envs=8"]).env.num_envs
+        >>> compose("quickstart", ["seed=8"]).seed
         8
     """
     recipe, problems = inspect_recipe(name_or_path, overrides)
@@ -57,7 +57,7 @@ def compose(
     return recipe
 
 
-def compose_runs(name_or_path: str | Path, overrides: Sequence[str]) -> list[Recipe]:
+def compose_runs(name_or_path: str | Path, overrides: Sequence[str]) -> list[RunRecipe]:
     """Compose one recipe for each combination of `key=a,b` (flag -m).
 
     Each run gets a numbered folder inside `run_dir`, or inside runs/<name>-grid.
@@ -72,7 +72,7 @@ def compose_runs(name_or_path: str | Path, overrides: Sequence[str]) -> list[Rec
 def inspect_recipe(
     name_or_path: str | Path,
     overrides: Sequence[str] = (),
-) -> tuple[Recipe, list[str]]:
+) -> tuple[RunRecipe, list[str]]:
     """Compose without raising: the recipe (unusable with problems) and the problems."""
     path = find_recipe(name_or_path)
     dirs = [path.parent, *(d for d in search_dirs() if d != path.parent)]
@@ -87,14 +87,16 @@ def inspect_recipe(
     apply_values(merged, parsed, groups, problems)
     data = _to_container(merged, problems)
     data.setdefault("name", path.stem)
-    ablations = (named | chosen).get("ablation")
+    groups_used = named | chosen
+    ablations = groups_used.get("ablation")
     if ablations:
         data["ablation"] = "+".join(ablations)
+    data = mark_groups(data, [g for g, options in groups_used.items() if options])
     recipe, found = read_recipe(data)
     return recipe, problems + found
 
 
-def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
     """Read a complete recipe, as `dump_recipe` wrote it, without composing.
 
     Args:
@@ -112,7 +114,7 @@ def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     return _change(config, overrides, where=str(path))
 
 
-def dump_recipe(recipe: Recipe, path: str | Path | None = None) -> str:
+def dump_recipe(recipe: RunRecipe, path: str | Path | None = None) -> str:
     """Return the complete recipe as YAML, and write it when a path is given."""
     text = OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(recipe)))
     if path is not None:
@@ -120,13 +122,13 @@ def dump_recipe(recipe: Recipe, path: str | Path | None = None) -> str:
     return text
 
 
-def override_recipe(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+def override_recipe(recipe: RunRecipe, overrides: Sequence[str]) -> RunRecipe:
     """Change values of a composed recipe."""
     config = OmegaConf.create(dataclasses.asdict(recipe))
     return _change(config, overrides, where=f"recipe {recipe.name}")
 
 
-def _change(config: DictConfig, overrides: Sequence[str], *, where: str) -> Recipe:
+def _change(config: DictConfig, overrides: Sequence[str], *, where: str) -> RunRecipe:
     parsed, problems = parse_overrides(overrides)
     apply_values(config, parsed, {}, problems)
     recipe, found = read_recipe(_to_container(config, problems))
@@ -135,27 +137,22 @@ def _change(config: DictConfig, overrides: Sequence[str], *, where: str) -> Reci
     return recipe
 
 
-def _base() -> dict[str, Any]:
-    """Return what the files are merged onto: all named parts with no option set."""
-    return {"env": {kind: default_mapping(kind) for kind in REGISTRY}}
-
-
 def _merge_files(
     path: Path, dirs: list[Path], choices: list[str], problems: list[str]
 ) -> DictConfig:
     """Let Hydra merge the recipe with its groups; its complaint becomes a problem."""
-    base = OmegaConf.create(_base())
     where = ",".join(f"'file://{folder}'" for folder in dirs[1:])
     search = f"hydra.searchpath=[{where}]"
     try:
         with hydra.initialize_config_dir(str(dirs[0]), version_base="1.3"):
             config = hydra.compose(path.stem, overrides=[search, *choices])
         OmegaConf.set_struct(config, False)
-        merged = OmegaConf.merge(base, config)
+        merged = OmegaConf.merge(OmegaConf.create(kind_of(config).base), config)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         problems.append(f"{path.name}: {' '.join(str(error).split())}")
-        return base
-    return merged if isinstance(merged, DictConfig) else base
+        return OmegaConf.create({})
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 def _to_container(config: DictConfig, problems: list[str]) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import flashdex.hands
 from flashdex.errors import nearest
-from flashdex.recipe.schema import Recipe
+from flashdex.recipe.algo import AlgoConfig
+from flashdex.recipe.schema import Expectation, Recipe
 
 
 def known_hands() -> list[str]:
@@ -54,38 +55,61 @@ def _rate(recipe: Recipe) -> list[str]:
 
 
 def _replay(recipe: Recipe) -> list[str]:
-    algo = recipe.algo
+    return replay_conflicts(
+        recipe.algo,
+        total_env_steps=recipe.total_env_steps,
+        num_envs=recipe.env.num_envs,
+        where="env.num_envs",
+    )
+
+
+def replay_conflicts(
+    algo: AlgoConfig, *, total_env_steps: int, num_envs: int, where: str
+) -> list[str]:
+    """Return what does not fit between replay buffer, budget and worlds.
+
+    Args:
+        algo: sizes of the buffer.
+        total_env_steps: budget.
+        num_envs: worlds.
+        where: key that gives the worlds, for the message.
+    """
     problems = []
     if algo.min_buffer > algo.buffer_size:
         problems.append(
             f"algo.min_buffer: {algo.min_buffer} rows never fit in algo.buffer_size="
             f"{algo.buffer_size}; learning would not start"
         )
-    if algo.min_buffer >= recipe.total_env_steps > 1:
+    if algo.min_buffer >= total_env_steps > 1:
         problems.append(
             f"algo.min_buffer: {algo.min_buffer} rows of random actions use up "
-            f"total_env_steps={recipe.total_env_steps}"
+            f"total_env_steps={total_env_steps}"
         )
     # The newest n steps of every world have no complete return yet.
-    if algo.buffer_size <= recipe.env.num_envs * algo.n_step:
+    if algo.buffer_size <= num_envs * algo.n_step:
         problems.append(
-            f"algo.buffer_size: {algo.buffer_size} must exceed env.num_envs x "
-            f"algo.n_step = {recipe.env.num_envs * algo.n_step}"
+            f"algo.buffer_size: {algo.buffer_size} must exceed {where} x "
+            f"algo.n_step = {num_envs * algo.n_step}"
         )
     return problems
 
 
 def _algo(recipe: Recipe) -> list[str]:
     algo = recipe.algo
-    problems = []
-    if algo.lr_final > algo.lr:
-        problems.append(f"algo.lr_final: {algo.lr_final} is above algo.lr={algo.lr}")
+    problems = rate_conflicts(algo)
     if len(algo.future_channels) != 3 or min(algo.future_channels) < 1:
         problems.append(
             f"algo.future_channels: expected three positive numbers, found "
             f"{algo.future_channels}"
         )
     return problems
+
+
+def rate_conflicts(algo: AlgoConfig) -> list[str]:
+    """Return what does not fit between the learning rates."""
+    if algo.lr_final > algo.lr:
+        return [f"algo.lr_final: {algo.lr_final} is above algo.lr={algo.lr}"]
+    return []
 
 
 def _env(recipe: Recipe) -> list[str]:
@@ -114,8 +138,13 @@ def _env(recipe: Recipe) -> list[str]:
 
 
 def _expect(recipe: Recipe) -> list[str]:
+    return expect_conflicts(recipe.expect)
+
+
+def expect_conflicts(entries: list[Expectation]) -> list[str]:
+    """Return the promises that promise nothing."""
     return [
         f"expect[{i}]: give min, max or both"
-        for i, entry in enumerate(recipe.expect)
+        for i, entry in enumerate(entries)
         if entry.min is None and entry.max is None
     ]

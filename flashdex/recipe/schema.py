@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 from flashdex.recipe.algo import AlgoConfig, LoggerConfig, TrainConfig
 from flashdex.recipe.env import EnvConfig, MotionsConfig, PhysicsConfig
@@ -25,13 +26,8 @@ class Expectation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """One training run, complete.
-
-    Example:
-        >>> Recipe(name="tiny", total_env_steps=1000).env.num_envs
-        2048
-    """
+class RunRecipe:
+    """What every kind of recipe has."""
 
     name: str
     """Name of the recipe; taken from the file name when absent."""
@@ -43,6 +39,28 @@ class Recipe:
     """Seed of everything that is drawn."""
     run_dir: str | None = None
     """Folder of the run; null = runs/<name>-<ablation>-s<seed>."""
+    logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
+    """Metric writers."""
+    expect: list[Expectation] = dataclasses.field(default_factory=list)
+    """Promised numbers."""
+
+    @property
+    def tags(self) -> list[str]:
+        """Words that tell this run from others."""
+        return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(RunRecipe):
+    """One training run, complete.
+
+    Example:
+        >>> Recipe(name="tiny", total_env_steps=1000).env.num_envs
+        2048
+    """
+
+    task: Literal["retarget"] = "retarget"
+    """What is trained: motions; `gym` is the other kind, with keys of its own."""
     hand: str = "xhand"
     """Robot hand."""
     motions: MotionsConfig = dataclasses.field(default_factory=MotionsConfig)
@@ -55,7 +73,8 @@ class Recipe:
     """Learner."""
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     """Loop."""
-    logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
-    """Metric writers."""
-    expect: list[Expectation] = dataclasses.field(default_factory=list)
-    """Promised numbers."""
+
+    @property
+    def tags(self) -> list[str]:
+        """Words that tell this run from others."""
+        return [self.hand, self.physics.engine]

@@ -12,6 +12,7 @@ from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.exploration import NoiseRepetition
 from flashdex.modules.future import FutureEncoder
+from flashdex.modules.layers import warm_up_statistics
 from flashdex.modules.policy import FlashPolicy
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.reward_normalizer import RewardNormalizer
@@ -51,6 +52,9 @@ class FlashSACAgent:
             config, observation_dim, action_dim, number, future_shape
         )
         critic = make_critic(config, observation_dim, action_dim, number, future_shape)
+        if config.norm_warmup:
+            warm_up_statistics(self.actor)
+            warm_up_statistics(critic)
         self.normalizer = RewardNormalizer(
             num_envs, number, gamma=config.gamma, bound=config.v_max
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -65,3 +65,17 @@ class AssistEpoch:
         }
         self._clear()
         return out
+
+    def state_dict(self) -> dict[str, Any]:
+        """Sums of the open epoch."""
+        return {
+            "sums": dict(self._sums),
+            "count": self._count,
+            "ended": self._ended,
+            "failed": self._failed,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore ``state_dict``."""
+        self._sums, self._count = dict(state["sums"]), state["count"]
+        self._ended, self._failed = state["ended"], state["failed"]

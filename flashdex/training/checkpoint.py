@@ -2,50 +2,173 @@
 
 from __future__ import annotations
 
+import copy
+import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from flashdex.errors import RunError
 from flashdex.files import open_atomic
 
+if TYPE_CHECKING:
+    from flashdex.training.replay_file import ReplayLog
+
+_LOG = logging.getLogger(__name__)
 FOLDER = "checkpoints"
+FORMAT = 1  # raised whenever older code could misread a checkpoint
 
 
-def save_checkpoint(run_dir: Path, state: dict[str, Any], *, keep: int) -> Path:
+def save_checkpoint(
+    run_dir: Path,
+    state: dict[str, Any],
+    *,
+    keep: int,
+    replay: ReplayLog | None = None,
+) -> Path:
     """Write ``checkpoints/<env_steps>.pt`` in one piece and drop the oldest.
+
+    Replay rows are on the disk before the checkpoint that needs them, and go after the
+    last one that does: a crash in between leaves the former pair usable.
 
     Args:
         run_dir: run directory.
-        state: tensors and plain Python values only.
+        state: tensors and plain Python values only; ``env_steps`` names the file.
         keep: newest checkpoints that stay.
+        replay: rows to store beside it.
+
+    Raises:
+        OSError: the disk is full, say; the former checkpoints are as they were.
     """
-    folder = run_dir / FOLDER
-    path = folder / f"{state['env_steps']:012d}.pt"
-    with open_atomic(path) as file:
-        torch.save(state, file)
-    for old in sorted(folder.glob("*.pt"))[:-keep]:
-        old.unlink()
+    path = run_dir / FOLDER / f"{checkpoint_name(state['env_steps'])}.pt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        if replay is not None:
+            replay.save(path.stem)
+        with open_atomic(path) as file:
+            torch.save({"format": FORMAT, **state}, file)
+    except RuntimeError as error:
+        # torch's writer reports a failed write as a RuntimeError of its own
+        raise OSError(f"{path}: {error}") from error
+    finally:
+        for old in _newest_first(run_dir)[keep:]:
+            old.unlink()
+        if replay is not None:
+            replay.prune(checkpoint_names(run_dir))
     return path
 
 
 def load_checkpoint(run_dir: Path) -> dict[str, Any]:
-    """Read the newest checkpoint of a run.
+    """Read the newest checkpoint of a run that can be read.
+
+    One that cannot (a full or failing disk) is named in a warning, and the one before
+    is taken.
 
     Raises:
-        RunError: there is none, or it cannot be read.
+        RunError: there is none, none can be read, or another version wrote it.
     """
-    found = sorted((run_dir / FOLDER).glob("*.pt"))
+    found = _newest_first(run_dir)
     if not found:
         raise RunError(
             f"{run_dir}: no checkpoint in '{FOLDER}/'. A run writes one every "
             "train.checkpoint_every_s seconds and when it is stopped."
         )
-    try:
-        return torch.load(found[-1], map_location="cpu", weights_only=True)
-    except Exception as error:
+    faults = []
+    for path in found:
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:
+            faults.append(f"{path.name}: {_first_line(error)}")
+            _LOG.warning("%s cannot be read, trying the one before", path)
+            continue
+        check_format(state, path)
+        return state
+    raise RunError(
+        f"{run_dir / FOLDER}: no checkpoint can be read ({'; '.join(faults)}). Restore "
+        "one from a copy, or start a new run; stored conversions are not affected."
+    )
+
+
+def check_format(state: Any, path: Path) -> None:
+    """Refuse a checkpoint of another version.
+
+    Args:
+        state: what the file holds.
+        path: the file, for the message.
+    """
+    found = state.get("format", 0) if isinstance(state, dict) else None
+    if found != FORMAT:
         raise RunError(
-            f"{found[-1]}: cannot be read ({error}). Delete it to fall back to the "
-            "one before."
-        ) from error
+            f"{path}: checkpoint format {found}, this version reads {FORMAT}. Go on "
+            "with the flashdex that wrote it (versions.json in the run), or start anew."
+        )
+
+
+def checkpoint_name(env_steps: int) -> str:
+    """Stem of the files of a checkpoint."""
+    return f"{env_steps:012d}"
+
+
+def checkpoint_names(run_dir: Path) -> set[str]:
+    """Stems of all checkpoints of a run."""
+    return {path.stem for path in _newest_first(run_dir)}
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    """Whether the run wrote any checkpoint, readable or not."""
+    return bool(_newest_first(run_dir))
+
+
+def newest_checkpoint(run_dir: Path) -> str:
+    """Name of the newest checkpoint for messages, ``none`` without one."""
+    found = _newest_first(run_dir)
+    return f"{FOLDER}/{found[0].name}" if found else "none"
+
+
+def set_aside_newer(run_dir: Path, env_steps: int) -> None:
+    """Rename what lies beyond the checkpoint that a run goes on from.
+
+    Only unreadable ones do. Under their name they would be tried first at every resume
+    and rotate good ones out.
+
+    Args:
+        run_dir: run directory.
+        env_steps: counter of the checkpoint that was read.
+    """
+    for path in _newest_first(run_dir):
+        if int(path.stem) > env_steps:
+            path.replace(path.with_suffix(".unreadable"))
+
+
+def remove_temporaries(run_dir: Path) -> None:
+    """Delete the half-written files that a killed run left behind."""
+    for path in run_dir.rglob(".*.tmp"):
+        path.unlink(missing_ok=True)
+
+
+def snapshot(state: Any) -> Any:
+    """Copy of a nested state on the CPU that shares no memory with the original.
+
+    Args:
+        state: tensors and plain values in dicts, lists and tuples.
+    """
+    if isinstance(state, Tensor):
+        return state.detach().to("cpu", copy=True)
+    if isinstance(state, dict):
+        out = copy.copy(state)  # keeps the version notes of a module's state
+        out.update({key: snapshot(value) for key, value in state.items()})
+        return out
+    if isinstance(state, list | tuple):
+        return type(state)(snapshot(value) for value in state)
+    return state
+
+
+def _newest_first(run_dir: Path) -> list[Path]:
+    found = (run_dir / FOLDER).glob("*.pt")
+    return sorted((p for p in found if p.stem.isdigit()), reverse=True)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

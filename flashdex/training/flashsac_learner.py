@@ -16,6 +16,8 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.base import assemble
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
+from flashdex.training.checkpoint import snapshot
+from flashdex.training.guard import finite_rows
 from flashdex.training.hand_groups import HandGroups
 from flashdex.training.nstep import NStepAssembler
 from flashdex.training.rows import RowCodec
@@ -64,9 +66,13 @@ class FlashSACLearner:
         self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
         self.codec = RowCodec(bank)
         self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(config.buffer_size), batch_size=config.batch_size
+            storage=LazyTensorStorage(config.buffer_size),
+            batch_size=config.batch_size,
+            generator=self.generator,
         )
         self._debt = 0.0
+        self.num_dropped = 0  # rows that were not finite
+        self.last_update: dict[str, Any] | None = None
 
     @property
     def ready(self) -> bool:
@@ -126,10 +132,17 @@ class FlashSACLearner:
         terminated: Tensor,
         done: Tensor,
     ) -> None:
-        """Update the reward statistics and store what the n-step window yields."""
+        """Update the reward statistics and store what the n-step window yields.
+
+        Rows that are not finite are dropped and counted: one in a thousand samples
+        would be enough to lose the networks.
+        """
         active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
+        finite = reward.isfinite()
         self.agent.normalizer.update(
-            self.groups.rewards(reward), done, self.groups.mask(active)
+            self.groups.rewards(torch.where(finite, reward, 0.0)),
+            done,
+            self.groups.mask(active & finite),
         )
         row = self.nstep.push(
             state.select(*keys.STATE),
@@ -140,7 +153,17 @@ class FlashSACLearner:
             done,
         )
         if row is not None:
-            self.buffer.extend(self.codec.pack(row))
+            self._store(row)
+
+    def _store(self, row: TensorDict) -> None:
+        packed = self.codec.pack(row)
+        # half precision overflows where float32 does not
+        fits = packed["state"].isfinite() & packed["next_state"].isfinite()
+        good = finite_rows(row) & fits.all(-1)
+        bad = len(good) - int(good.sum())
+        self.num_dropped += bad
+        if bad < len(good):
+            self.buffer.extend(packed[good] if bad else packed)
 
     def sample(self) -> TensorDict:
         """A replay sample, assembled: what the loss reads, batch (B,)."""
@@ -163,7 +186,24 @@ class FlashSACLearner:
 
     def update(self) -> TensorDict:
         """One FlashSAC update on a fresh sample; returns its metrics."""
-        return self.agent.update(self.sample())
+        batch = self.sample()
+        self.last_update = {
+            "batch": batch.to_dict(),
+            "batch_size": len(batch),
+            "generator": self.generator.get_state(),
+        }
+        return self.agent.update(batch)
+
+    def redo(self, update: dict[str, Any]) -> TensorDict:
+        """Perform an update again on the batch and with the draws it had.
+
+        Args:
+            update: ``last_update`` of the learner that performed it.
+        """
+        self.last_update = update
+        self.generator.set_state(update["generator"])
+        batch = TensorDict(update["batch"], batch_size=[update["batch_size"]])
+        return self.agent.update(batch)
 
     def forget_episodes(self) -> None:
         """Drop the open n-step window and the running returns."""
@@ -171,15 +211,23 @@ class FlashSACLearner:
         self.agent.normalizer.clear_returns()
 
     def state_dict(self) -> dict[str, Any]:
-        """Agent, n-step tail and update debt; the replay rows are not part of it."""
-        return {
+        """A copy of agent, n-step tail and update debt; replay rows are no part of it.
+
+        The generator is the agent's: it also draws the replay samples.
+        """
+        state = {
             "agent": self.agent.state_dict(),
             "nstep": self.nstep.state_dict(),
             "debt": self._debt,
+            "dropped": self.num_dropped,
         }
+        return snapshot(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``."""
+        """Restore a copy of ``state_dict``."""
+        # Adam keeps the very tensors it is given: two learners would share them.
+        state = snapshot(state)
         self.agent.load_state_dict(state["agent"])
         self.nstep.load_state_dict(state["nstep"])
         self._debt = state["debt"]
+        self.num_dropped = state["dropped"]

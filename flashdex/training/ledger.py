@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from flashdex import keys
 from flashdex.errors import RunError
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
+from flashdex.metrics.rollout import Rollout
 from flashdex.training.attempts import Attempt
-from flashdex.training.jsonl import drop_cut_line, read_lines
+from flashdex.training.jsonl import append_line, drop_cut_line, read_lines
 
 _LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"
@@ -44,7 +46,7 @@ class Ledger:
     """Judges attempts, writes a line for each, stores the first that passes.
 
     A stored rollout is on disk, complete, before its line is written: a crash can lose
-    a line, never a conversion that has a line.
+    a line, never a conversion that has a line. ``adopt`` writes the line that is lost.
 
     Args:
         run_dir: run directory.
@@ -146,7 +148,7 @@ class Ledger:
         }
         if first or unproven:
             line.update(self._store(attempt, line))
-        self._append(line)
+        append_line(self.path, line)
         self._count(line)
         return self.conversions[name] if first else None
 
@@ -167,11 +169,49 @@ class Ledger:
             out["verdict"] = certificate.verdict
         return out
 
-    def _append(self, line: dict[str, Any]) -> None:
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+    def adopt(self, *, wall_s: float) -> list[str]:
+        """Write the lines of stored rollouts that a crash left without one.
+
+        Each is judged anew from its file alone. One that does not pass stays where it
+        is, without a line; a later conversion replaces it.
+
+        Args:
+            wall_s: clock of the run, for the lines.
+
+        Returns:
+            Motions whose lines were written.
+        """
+        told = {
+            line["rollout"]: line["env_steps"]
+            for line in read_lines(self.path)
+            if line.get("rollout")
+        }
+        out = []
+        for row, name in enumerate(self.names):
+            path = self.rollouts / f"{name}.npz"
+            if not path.is_file():
+                continue
+            # A later pass replaces the file of an unproven one: compare when it was.
+            if told.get(f"{ROLLOUTS}/{path.name}") == _env_steps(path):
+                continue
+            attempt = _stored_attempt(path, row)
+            verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
+            if verdicts[self.criterion].is_passed:
+                steps = attempt.rollout.env_steps
+                self.record(attempt, env_steps=steps, wall_s=wall_s)
+                out.append(name)
+        return out
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of the file."""
+        return self.path.stat().st_size if self.path.is_file() else 0
+
+    @property
+    def note(self) -> str:
+        """What was achieved, in a few words."""
+        text = f"{self.num_converted}/{len(self.names)} converted"
+        return f"{text}, {self.num_certified} certified" if self.conversions else text
 
     @property
     def num_converted(self) -> int:
@@ -203,6 +243,19 @@ class Ledger:
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours
         return out
+
+
+def _env_steps(path: Path) -> int:
+    """When a stored rollout was made; reads nothing else of the file."""
+    with np.load(path, allow_pickle=False) as file:
+        return int(file["env_steps"])
+
+
+def _stored_attempt(path: Path, row: int) -> Attempt:
+    """A stored rollout as the attempt it was."""
+    rollout = Rollout.load(path)
+    complete = rollout.num_frames >= rollout.reference_length
+    return Attempt(rollout, row, complete, [], rollout.num_frames)
 
 
 def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str, Any]]:

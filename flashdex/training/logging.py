@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from flashdex.errors import FlashdexError
-from flashdex.training.jsonl import drop_cut_line
+from flashdex.files import write_atomic
+from flashdex.training.jsonl import drop_cut_line, keep_lines
 
 if TYPE_CHECKING:
-    from flashdex.recipe import Recipe
+    from flashdex.recipe import RunRecipe
 
 METRICS = "metrics.jsonl"
 
@@ -33,11 +35,16 @@ class JsonlWriter:
 
     Args:
         run_dir: run directory.
+        env_steps: of the checkpoint a resumed run goes on from. Later records belong
+            to steps that are done again, and are removed.
     """
 
-    def __init__(self, run_dir: Path) -> None:
-        drop_cut_line(run_dir / METRICS)
-        self._file = (run_dir / METRICS).open("a", encoding="utf-8")
+    def __init__(self, run_dir: Path, *, env_steps: int | None = None) -> None:
+        path = run_dir / METRICS
+        drop_cut_line(path)
+        if env_steps is not None:
+            keep_lines(path, lambda record: record["env_steps"] <= env_steps)
+        self._file = path.open("a", encoding="utf-8")
 
     def write(self, record: dict[str, float]) -> None:
         """Append and flush."""
@@ -50,28 +57,47 @@ class JsonlWriter:
 
 
 class CsvWriter:
-    """Writes ``metrics.csv``; its columns are those of the first record.
+    """Writes ``metrics.csv``; a new key adds a column, empty in the rows above.
 
     Args:
         run_dir: run directory.
+        env_steps: as for `JsonlWriter`.
     """
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, *, env_steps: int | None = None) -> None:
         self._path = run_dir / "metrics.csv"
-        self._fields: list[str] | None = None
-        if self._path.is_file():
-            with self._path.open(encoding="utf-8") as file:
-                self._fields = next(csv.reader(file), None)
+        self._fields: list[str] = []
+        if not self._path.is_file():
+            return
+        drop_cut_line(self._path)
+        with self._path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            self._fields = list(reader.fieldnames or [])
+            rows = list(reader)
+        if env_steps is not None:
+            kept = [r for r in rows if float(r["env_steps"]) <= env_steps]
+            if len(kept) < len(rows):
+                self._rewrite(kept)
 
     def write(self, record: dict[str, float]) -> None:
         """Append one row."""
-        fresh = self._fields is None
-        self._fields = self._fields or list(record)
+        fresh = [key for key in record if key not in self._fields]
+        if fresh:
+            rows = []
+            if self._path.is_file():
+                with self._path.open(newline="", encoding="utf-8") as file:
+                    rows = list(csv.DictReader(file))
+            self._fields += fresh
+            self._rewrite(rows)
         with self._path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self._fields, extrasaction="ignore")
-            if fresh:
-                writer.writeheader()
-            writer.writerow(record)
+            csv.DictWriter(file, self._fields).writerow(record)
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._fields)
+        writer.writeheader()
+        writer.writerows(rows)
+        write_atomic(self._path, text.getvalue())
 
     def close(self) -> None:
         """Every row is on disk already."""
@@ -87,7 +113,7 @@ class WandbWriter:
     """
 
     def __init__(
-        self, run_dir: Path, recipe: Recipe, *, run_id: str | None = None
+        self, run_dir: Path, recipe: RunRecipe, *, run_id: str | None = None
     ) -> None:
         try:
             import wandb
@@ -103,7 +129,7 @@ class WandbWriter:
             group=c.wandb_group or recipe.name,
             name=f"{recipe.name}-{recipe.ablation}-s{recipe.seed}",
             job_type="train",
-            tags=[recipe.hand, recipe.physics.engine, *c.wandb_tags],
+            tags=[*recipe.tags, *c.wandb_tags],
             mode=c.wandb_mode,
             dir=str(run_dir),
             id=run_id,
@@ -131,15 +157,21 @@ class MetricLog:
         run_dir: run directory.
         recipe: names the writers.
         wandb_id: id of an earlier session.
+        env_steps: of the checkpoint a resumed run goes on from; later records go.
     """
 
     def __init__(
-        self, run_dir: Path, recipe: Recipe, *, wandb_id: str | None = None
+        self,
+        run_dir: Path,
+        recipe: RunRecipe,
+        *,
+        wandb_id: str | None = None,
+        env_steps: int | None = None,
     ) -> None:
-        self.writers: list[MetricWriter] = [JsonlWriter(run_dir)]
+        self.writers: list[MetricWriter] = [JsonlWriter(run_dir, env_steps=env_steps)]
         self.wandb_id = wandb_id
         if "csv" in recipe.logger.kind:
-            self.writers.append(CsvWriter(run_dir))
+            self.writers.append(CsvWriter(run_dir, env_steps=env_steps))
         if "wandb" in recipe.logger.kind:
             writer = WandbWriter(run_dir, recipe, run_id=wandb_id)
             self.wandb_id = writer.run_id

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import logging
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +11,32 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
-from tqdm import tqdm
 
 from flashdex import keys
 from flashdex.envs.judge import Outcome
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
-from flashdex.recipe import Recipe
+from flashdex.recipe import Recipe, dump_recipe
 from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempts import AttemptRecorder
 from flashdex.training.checkpoint import save_checkpoint
+from flashdex.training.guard import (
+    GradientGuard,
+    NonFiniteError,
+    first_non_finite,
+    numeric_errors,
+)
 from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
+from flashdex.training.nan_dump import stop_with_dump
+from flashdex.training.progress import Progress
+from flashdex.training.replay_file import ReplayLog
+from flashdex.training.sessions import SIGNAL, Start
+from flashdex.training.signals import StopSignals
 from flashdex.training.stats import RunningStats
 
 _LOG = logging.getLogger(__name__)
-PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal
 
 
 class Trainer:
@@ -43,6 +49,8 @@ class Trainer:
         learner: acts and learns.
         ledger: judges attempts.
         log: metric writers.
+        start: where the session begins.
+        replay: stores replay rows with the checkpoints, or None.
         provenance: stored with every rollout.
     """
 
@@ -54,10 +62,14 @@ class Trainer:
         learner: Learner,
         ledger: Ledger,
         log: MetricLog,
+        *,
+        start: Start,
+        replay: ReplayLog | None = None,
         provenance: dict[str, str] | None = None,
     ) -> None:
         self.recipe, self.run_dir, self.env = recipe, run_dir, env
         self.learner, self.ledger, self.log = learner, ledger, log
+        self.start, self.replay = start, replay
         self.recorder = AttemptRecorder(
             env,
             criterion=recipe.train.criterion,
@@ -66,46 +78,62 @@ class Trainer:
         )
         self.stats = RunningStats()
         self.assist_epoch = AssistEpoch()
-        self.env_steps = 0
-        self.wall_before = 0.0
+        self.guard = GradientGuard()
+        self.stop = StopSignals()
+        self.env_steps = start.env_steps
         self._vector_steps = 0
-        self._start = time.monotonic()
-        self._last_line = self._start
-        self._stop = False
+        self._saved_at = self._logged_at = start.env_steps
+        self._last_record: dict[str, float] = {}
+        self._began = time.monotonic()
 
     @property
     def wall_s(self) -> float:
         """Seconds of this run, earlier sessions included."""
-        return self.wall_before + time.monotonic() - self._start
+        return self.start.wall_s + time.monotonic() - self._began
 
     def run(self) -> str:
-        """Train until the budget, a limit or a signal ends it; return why."""
-        recipe, train = self.recipe, self.recipe.train
+        """Train until the budget, a limit or a signal ends it; return why.
+
+        Raises:
+            RunError: something was not finite, or the run directory cannot be written.
+        """
         for name in self.ledger.conversions:
             self._mark_converted(name)
+        try:
+            with self.stop, self.guard:
+                why = self._loop()
+                self._write_log()
+                self.save()
+        except NonFiniteError as error:
+            raise self._dump(str(error)) from error
+        except OSError as error:
+            raise RunError(
+                f"{self.run_dir}: cannot be written ({error}). The run stopped; what "
+                "is stored is whole. Make room, then continue it with 'flashdex train "
+                f"--resume {self.run_dir}'."
+            ) from error
+        return why
+
+    def _loop(self) -> str:
+        train, total = self.recipe.train, self.recipe.total_env_steps
         td = self.env.reset()
         self.recorder.begin(torch.arange(self.env.num_envs))
-        last_log = last_save = time.monotonic()
-        why = "budget"
-        with self._signals(), self._bar() as bar:
-            while self.env_steps < recipe.total_env_steps:
+        self._last_log = last_save = time.monotonic()
+        bar = Progress(self.recipe.name, total=total, done=self.env_steps)
+        try:
+            while not (why := self._end_reason()):
                 td = self.vector_step(td)
                 bar.update(self.env.num_envs)
                 now = time.monotonic()
-                if now - last_log >= train.log_every_s:
-                    self._write_log(now - last_log)
-                    self._show(bar)
-                    last_log = now
+                if now - self._last_log >= train.log_every_s:
+                    self._write_log()
+                    note = self.ledger.note
+                    bar.show(note, env_steps=self.env_steps, wall_s=self.wall_s)
                 if now - last_save >= train.checkpoint_every_s:
-                    self.save()
-                    last_save = now
-                why = self._end_reason()
-                if why:
-                    break
-            else:
-                why = "budget"
-        self._write_log(max(time.monotonic() - last_log, 1e-9))
-        self.save()
+                    self._try_to_save()
+                    last_save = time.monotonic()
+        finally:
+            bar.close()
         return why
 
     def vector_step(self, td: TensorDictBase) -> TensorDictBase:
@@ -156,7 +184,7 @@ class Trainer:
 
     def _learn(self) -> None:
         for _ in range(self.learner.due()):
-            with self.stats.time("update"):
+            with self.stats.time("update"), numeric_errors(self.learner):
                 self.stats.add_update(self.learner.update())
 
     def _assist_epoch(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
@@ -171,8 +199,10 @@ class Trainer:
 
     def _end_reason(self) -> str:
         train = self.recipe.train
-        if self._stop:
-            return "signal"
+        if self.env_steps >= self.recipe.total_env_steps:
+            return "budget"
+        if self.stop.requested:
+            return SIGNAL
         if train.wall_limit_s is not None and self.wall_s > train.wall_limit_s:
             return "wall_limit_s"
         everything = self.ledger.num_converted == len(self.ledger.names)
@@ -180,97 +210,89 @@ class Trainer:
             return "all converted"
         return ""
 
-    def _write_log(self, seconds: float) -> None:
+    def _write_log(self) -> None:
+        if self.env_steps == self._logged_at:
+            return  # a clean stop has just logged, or a resume has nothing left to do
         record: dict[str, Any] = {
             "env_steps": self.env_steps,
+            "env_steps_lost": self.start.lost,
             "hours": self.wall_s / 3600,
             "updates": self.learner.updates,
         }
         record.update(self.ledger.metrics(self.wall_s / 3600))
+        now = time.monotonic()
+        seconds = max(now - self._last_log, 1e-9)
         record.update(self.stats.pop(seconds, self.env.num_envs))
         record["buffer/rows"] = self.learner.num_rows
+        record["buffer/dropped"] = getattr(self.learner, "num_dropped", 0)
         assist = self.env.assist
         record["assist/level"] = assist.upper[0] if assist is not None else 0.0
+        self._last_record = {k: float(v) for k, v in record.items()}
+        self.guard.check()
+        if bad := first_non_finite(self._last_record):
+            raise NonFiniteError(bad)
         self.log.write(record)
+        self._last_log, self._logged_at = now, self.env_steps
 
-    def _show(self, bar: tqdm) -> None:
-        total = len(self.ledger.names)
-        note = f"{self.ledger.num_converted}/{total} converted"
-        if self.ledger.num_converted:
-            note += f", {self.ledger.num_certified} certified"
-        bar.set_postfix_str(note)
-        now = time.monotonic()
-        if bar.disable and now - self._last_line >= PLAIN_LOG_S:
-            self._last_line = now
-            _LOG.info(
-                "%d of %d env steps, %s, %.0f s",
-                self.env_steps,
-                self.recipe.total_env_steps,
-                note,
-                self.wall_s,
-            )
-
-    def _bar(self) -> tqdm:
-        # Without a terminal tqdm would fill the log with carriage returns.
-        return tqdm(
-            total=self.recipe.total_env_steps,
-            initial=self.env_steps,
-            unit="step",
-            unit_scale=True,
-            desc=self.recipe.name,
-            disable=None,
-            dynamic_ncols=True,
+    def _dump(self, what: str) -> RunError:
+        return stop_with_dump(
+            self.run_dir,
+            what,
+            recipe=self.recipe,
+            learner=self.learner,
+            env_steps=self.env_steps,
+            metrics=self._last_record,
         )
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Turn Ctrl-C and SIGTERM into a clean end with a checkpoint."""
-
-        def stop(*_: object) -> None:
-            self._stop = True
-
-        names = (signal.SIGINT, signal.SIGTERM)
-        before = {n: signal.signal(n, stop) for n in names}
+    def _try_to_save(self) -> None:
+        """Save; a disk that is full may have room again at the next time."""
         try:
-            yield
-        finally:
-            for name, handler in before.items():
-                signal.signal(name, handler)
+            self.save()
+        except OSError as error:
+            _LOG.warning("no checkpoint this time, the run goes on: %s", error)
 
-    def save(self) -> Path:
-        """Write a checkpoint."""
-        return save_checkpoint(
-            self.run_dir, self.state_dict(), keep=self.recipe.train.keep_checkpoints
-        )
+    def save(self) -> None:
+        """Write a checkpoint, unless there is one of this very step.
+
+        Raises:
+            NonFiniteError: what would be stored is not finite.
+            OSError: it cannot be written.
+        """
+        if self.env_steps == self._saved_at:
+            return
+        self.guard.check()
+        state = self.state_dict()
+        if bad := first_non_finite(state["learner"]):
+            raise NonFiniteError(bad)
+        keep = self.recipe.train.keep_checkpoints
+        save_checkpoint(self.run_dir, state, keep=keep, replay=self.replay)
+        self._saved_at = self.env_steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a resumed run needs, tensors and plain values only."""
+        """Everything a resumed run needs, tensors and plain values only.
+
+        The samplers hold nothing but what the conversions say, and those are in files.
+        """
         assist = self.env.assist
         return {
             "env_steps": self.env_steps,
             "vector_steps": self._vector_steps,
             "wall_s": self.wall_s,
+            "env_steps_lost": self.start.lost,
             "learner": self.learner.state_dict(),
             "assist": None if assist is None else assist.state_dict(),
+            "assist_epoch": self.assist_epoch.state_dict(),
             "env_generator": self.env.generator.get_state(),
             "torch_rng": torch.get_rng_state(),
+            "ledger_bytes": self.ledger.num_bytes,
+            "recipe": dump_recipe(self.recipe),
             "wandb_id": self.log.wandb_id,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``; unfinished episodes begin anew."""
-        self.env_steps = state["env_steps"]
+        """Restore all of ``state_dict`` but the learner, which is restored already."""
         self._vector_steps = state["vector_steps"]
-        self.wall_before = state["wall_s"]
-        try:
-            self.learner.load_state_dict(state["learner"])
-        except RuntimeError as error:
-            raise RunError(
-                "the checkpoint does not fit the recipe: an override changed the "
-                f"networks, the observation or env.num_envs ({error}). Resume without "
-                "it, or start a new run."
-            ) from error
-        self.learner.forget_episodes()
+        self.assist_epoch.load_state_dict(state["assist_epoch"])
         if self.env.assist is not None and state["assist"] is not None:
             self.env.assist.load_state_dict(state["assist"])
             self.env.redraw_assist()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import json
 import logging
 import subprocess
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,30 @@ import torch
 
 from flashdex.errors import RunError
 from flashdex.files import write_atomic
-from flashdex.recipe import Recipe, dump_recipe, load_recipe
+from flashdex.recipe import (
+    Recipe,
+    RunRecipe,
+    dump_recipe,
+    expect_kind,
+    load_recipe,
+)
+from flashdex.training.assemble import RECIPE, make_trainer
 from flashdex.training.attempts import versions
-from flashdex.training.baselines import score_baselines
-from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.ledger import Ledger
-from flashdex.training.logging import MetricLog
-from flashdex.training.loop import Trainer
+from flashdex.training.checkpoint import (
+    has_checkpoint,
+    load_checkpoint,
+    remove_temporaries,
+    set_aside_newer,
+)
+from flashdex.training.lock import run_lock
+from flashdex.training.sessions import end_session
 from flashdex.training.setup import Workbench, open_workbench
 
 _LOG = logging.getLogger(__name__)
-RECIPE, VERSIONS, BASELINES = "recipe.yaml", "versions.json", "baselines.json"
+VERSIONS = "versions.json"
 
 
-def default_run_dir(recipe: Recipe) -> Path:
+def default_run_dir(recipe: RunRecipe) -> Path:
     """Folder of a run: the recipe's, or one named after recipe, ablation and seed."""
     if recipe.run_dir is not None:
         return Path(recipe.run_dir)
@@ -51,23 +60,28 @@ def train(recipe: Recipe) -> Path:
         )
     bench = open_workbench(recipe)
     create_run_dir(run_dir, recipe)
-    return _train(bench, run_dir, None)
+    with run_lock(run_dir):
+        return _train(bench, run_dir, None, [])
 
 
 def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
-    """Continue a run from its newest checkpoint.
+    """Continue a run from its newest checkpoint, or from the start without one.
 
     Args:
         run: run directory.
         overrides: ``key=value`` changes to the stored recipe.
     """
-    run_dir = Path(run)
+    run_dir, overrides = Path(run), overrides or []
     recipe = load_run_recipe(run_dir, overrides)
-    state = load_checkpoint(run_dir)
-    if overrides:
-        write_atomic(run_dir / RECIPE, dump_recipe(recipe))
-        (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
-    return _train(open_workbench(recipe), run_dir, state)
+    with run_lock(run_dir):
+        remove_temporaries(run_dir)
+        state = None
+        if has_checkpoint(run_dir):
+            state = load_checkpoint(run_dir)
+            set_aside_newer(run_dir, state["env_steps"])
+        else:
+            _LOG.warning("%s: stopped before its first checkpoint, from 0", run_dir)
+        return _train(open_workbench(recipe), run_dir, state, overrides)
 
 
 def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> Recipe:
@@ -75,10 +89,10 @@ def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> Recipe
     path = run_dir / RECIPE
     if not path.is_file():
         raise RunError(f"{run_dir}: not a run directory, there is no {RECIPE} in it.")
-    return load_recipe(path, overrides or [])
+    return expect_kind(load_recipe(path, overrides or []), Recipe, where=str(run_dir))
 
 
-def create_run_dir(run_dir: Path, recipe: Recipe) -> None:
+def create_run_dir(run_dir: Path, recipe: RunRecipe) -> None:
     """Make the folder with recipe, versions and the state of the source tree."""
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -111,42 +125,26 @@ def _git(*args: str) -> str:
     return done.stdout if done.returncode == 0 else ""
 
 
-def _provenance(bench: Workbench) -> dict[str, str]:
-    """Where a rollout comes from, apart from the versions stored with it."""
-    manifest = (bench.library.path / "manifest.json").read_bytes()
-    return {
-        "recipe_sha256": hashlib.sha256(dump_recipe(bench.recipe).encode()).hexdigest(),
-        "library_sha256": hashlib.sha256(manifest).hexdigest(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-
-
-def _train(bench: Workbench, run_dir: Path, state: dict[str, Any] | None) -> Path:
+def _train(
+    bench: Workbench,
+    run_dir: Path,
+    state: dict[str, Any] | None,
+    overrides: list[str],
+) -> Path:
+    """Train from a checkpoint, or from the beginning when there is none."""
     recipe = bench.recipe
     torch.manual_seed(recipe.seed)
     if recipe.train.torch_threads:
         torch.set_num_threads(recipe.train.torch_threads)
-    baselines = score_baselines(bench, run_dir / BASELINES)
-    env = bench.make_env()
-    learner = bench.make_learner(env)
-    ledger = Ledger(
-        run_dir,
-        bench.bank.names,
-        criterion=recipe.train.criterion,
-        seed=recipe.seed,
-        engine=recipe.physics.engine,
-        certify=recipe.train.certify,
-        trivial=baselines.trivial(recipe.train.criterion),
-    )
-    log = MetricLog(run_dir, recipe, wandb_id=state["wandb_id"] if state else None)
-    trainer = Trainer(
-        recipe, run_dir, env, learner, ledger, log, provenance=_provenance(bench)
-    )
-    if state is not None:
-        trainer.load_state_dict(state)
+    trainer = make_trainer(bench, run_dir, state, overrides)
+    why = "error"
     try:
         why = trainer.run()
     finally:
-        log.close()
+        trainer.log.close()
+        with contextlib.suppress(OSError):  # the disk may be what ended it
+            end_session(
+                run_dir, why, env_steps=trainer.env_steps, wall_s=trainer.wall_s
+            )
     _LOG.info("ended after %d env steps: %s", trainer.env_steps, why)
     return run_dir

@@ -28,6 +28,7 @@ from flashdex.motions.prepare import prepare
 from flashdex.recipe import Recipe
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner
+from flashdex.training.ppo_learner import PPOLearner
 
 _LOG = logging.getLogger(__name__)
 
@@ -98,13 +99,16 @@ class Workbench:
             self.hands,
             reference_offset=recipe.env.reference_offset,
         )
+        algo, example = recipe.algo, env.reset()
+        if algo.kind == "ppo":
+            return PPOLearner(algo, transforms, self.bank, example, seed=recipe.seed)
         steps = recipe.total_env_steps / env.num_envs
         return FlashSACLearner(
-            recipe.algo,
+            algo,
             transforms,
             self.bank,
-            env.reset(),
-            total_updates=max(1, math.ceil(steps * recipe.algo.updates_per_step)),
+            example,
+            total_updates=max(1, math.ceil(steps * algo.updates_per_step)),
             seed=recipe.seed,
         )
 

@@ -4,13 +4,14 @@ import pytest
 import torch
 from torch.nn import functional
 
-from flashdex.modules.batchnorm import batch_norm_relu
+from flashdex.modules.dense import linear_norm_relu
 from flashdex.modules.layers import (
     UnitBatchNorm,
     UnitLinear,
     UnitRMSNorm,
     dense_relu,
     project_,
+    warm_up_statistics,
 )
 
 
@@ -107,16 +108,31 @@ def test_dense_relu_matches_torch_batch_norm(mode):
 
 
 @pytest.mark.parametrize("keep", [None, slice(0, 4), slice(4, 8)], ids=str)
-def test_batch_norm_relu_gradient(keep):
+@pytest.mark.parametrize("outputs", [3, 5])
+def test_linear_norm_relu_gradient(keep, outputs):
+    """Finite differences, with the statistics taken on either side of the product."""
     torch.manual_seed(3)
-    x = torch.randn(2, 8, 3, dtype=torch.float64, requires_grad=True)
-    gamma = torch.rand(2, 3, dtype=torch.float64, requires_grad=True)
-    beta = torch.randn(2, 3, dtype=torch.float64, requires_grad=True)
+    x = torch.randn(2, 8, 4, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(2, outputs, 4, dtype=torch.float64, requires_grad=True)
+    gamma = torch.rand(2, outputs, dtype=torch.float64, requires_grad=True)
+    beta = torch.randn(2, outputs, dtype=torch.float64, requires_grad=True)
 
     def output(*inputs):
-        return batch_norm_relu(*inputs, eps=1e-5, keep=keep)[0]
+        return linear_norm_relu(*inputs, eps=1e-5, keep=keep)[0]
 
-    assert torch.autograd.gradcheck(output, (x, gamma, beta))
+    assert torch.autograd.gradcheck(output, (x, weight, gamma, beta))
+
+
+@pytest.mark.parametrize("outputs", [3, 5])
+def test_linear_norm_relu_returns_the_statistics_of_the_product(outputs):
+    torch.manual_seed(4)
+    x = 3 + torch.randn(2, 8, 4, dtype=torch.float64)
+    weight = torch.randn(2, outputs, 4, dtype=torch.float64)
+    ones = torch.ones(2, outputs, dtype=torch.float64)
+    _, mean, var = linear_norm_relu(x, weight, ones, ones, eps=1e-5)
+    z = torch.einsum("ebk,edk->ebd", x, weight)
+    assert torch.allclose(mean, z.mean(1), atol=1e-12)
+    assert torch.allclose(var, z.var(1, correction=0), atol=1e-12)
 
 
 def test_frozen_mode_reaches_inputs_only():
@@ -127,3 +143,18 @@ def test_frozen_mode_reaches_inputs_only():
     assert linear.weight.grad is None
     assert norm.weight.grad is None
     assert norm.bias.grad is None
+
+
+def test_warm_statistics_are_plain_means_until_the_momentum_takes_over():
+    norm = UnitBatchNorm(3, ensemble=2)
+    warm_up_statistics(norm)
+    means, variances = torch.randn(130, 2, 3), torch.rand(130, 2, 3)
+    for mean, var in zip(means[:100], variances[:100], strict=True):
+        norm.track_(mean, var, 11)
+    torch.testing.assert_close(norm.running_mean, means[:100].mean(0))
+    torch.testing.assert_close(norm.running_var, variances[:100].mean(0) * 1.1)
+    expected = means[:100].mean(0)
+    for mean, var in zip(means[100:], variances[100:], strict=True):
+        norm.track_(mean, var, 11)
+        expected = 0.99 * expected + 0.01 * mean
+    torch.testing.assert_close(norm.running_mean, expected)

@@ -2,63 +2,34 @@
 
 import pytest
 import torch
+from formulas import fill_networks, grid, observation
 from tensordict import TensorDict
 
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
-from flashdex.modules.layers import project_
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.stepper import FlashSACStepper
 
 ROWS, OBS, ACT = 16, 5, 2
 
 
-def _fill(weight, phase):
-    member, row, column = (torch.arange(n, dtype=torch.float64) for n in weight.shape)
-    value = 0.37 * (row[:, None] + 1) * (column + 2) + phase
-    with torch.no_grad():
-        weight.copy_(torch.sin(value + 0.5 * member[:, None, None]))
-
-
-def _fill_trunk(trunk):
-    _fill(trunk.embed.linear.weight, 0)
-    for i, block in enumerate(trunk.blocks):
-        _fill(block.linear1.weight, 1 + 2 * i)
-        _fill(block.linear2.weight, 2 + 2 * i)
-
-
-def _grid(columns, function, dtype):
-    row = torch.arange(ROWS, dtype=torch.float64)[:, None]
-    column = torch.arange(columns, dtype=torch.float64)
-    return function(row, column).to(dtype)
-
-
 def _make(dtype):
     actor = FlashActor(OBS, ACT, width=8, head="unit").to(dtype)
     critic = EnsembleCritic(OBS, ACT, width=16).to(dtype)
-    _fill_trunk(actor.trunk)
-    _fill(actor.head.weight[:, :ACT], 5)
-    _fill(actor.head.weight[:, ACT:], 6)
-    _fill_trunk(critic.trunk)
-    _fill(critic.head.weight, 5)
-    project_(actor)
-    project_(critic)
+    fill_networks(actor, critic)
     return FlashSACLoss(actor, critic, gamma=0.99).to(dtype)
 
 
 def _batch(dtype):
-    def observation(shift):
-        return _grid(
-            OBS, lambda b, j: 2 * torch.sin(0.7 * b + 1.3 * j + shift) + 0.5, dtype
-        )
-
     row = torch.arange(ROWS, dtype=torch.float64)
     return TensorDict(
         {
-            "observation": observation(0.0),
-            "action": _grid(ACT, lambda b, j: torch.sin(1.1 * b + 0.6 * j), dtype),
+            "observation": observation(ROWS, OBS).to(dtype),
+            "action": grid(ROWS, ACT, lambda b, j: torch.sin(1.1 * b + 0.6 * j)).to(
+                dtype
+            ),
             "next": {
-                "observation": observation(0.4),
+                "observation": observation(ROWS, OBS, 0.4).to(dtype),
                 "reward": torch.cos(0.9 * row)[:, None].to(dtype),
                 "terminated": (row % 5 == 0)[:, None],
             },
@@ -68,12 +39,12 @@ def _batch(dtype):
 
 
 def _noise(dtype):
-    def grid(function):
-        return _grid(ACT, function, dtype)[None]
+    def noise(function):
+        return grid(ROWS, ACT, function).to(dtype)[None]
 
     return {
-        "actor_noise": grid(lambda b, j: 1.5 * torch.sin(2.1 * b + 0.8 * j)),
-        "target_noise": grid(lambda b, j: 1.5 * torch.cos(1.7 * b + 0.5 * j)),
+        "actor_noise": noise(lambda b, j: 1.5 * torch.sin(2.1 * b + 0.8 * j)),
+        "target_noise": noise(lambda b, j: 1.5 * torch.cos(1.7 * b + 0.5 * j)),
     }
 
 
@@ -122,6 +93,19 @@ def test_golden_trace(dtype, tolerance):
     close(target.trunk.blocks[-1].norm2.running_var[1, 0], 0.984526030)
     close(_value(critic, td).mean(-1), [-0.037717087, -0.002252787])
     close(_value(target, td).mean(-1), [-0.038638719, 0.000415228])
+
+
+def test_target_rows_drift_below_one():
+    """Nothing projects the target: 0.999999 after eight updates, as published."""
+    loss = _make(torch.float64)
+    stepper = FlashSACStepper(loss)
+    for _ in range(8):
+        stepper.update(_batch(torch.float64), **_noise(torch.float64))
+    state = loss.target_qvalue_network.state_dict()
+    rows = [state[k].norm(dim=-1) for k in state if "linear" in k or k == "head.weight"]
+    norms = torch.cat([row.flatten() for row in rows])
+    assert norms.max() < 1
+    assert norms.mean().item() == pytest.approx(0.999999, abs=5e-7)
 
 
 def test_two_groups_with_the_same_task_repeat_the_trace():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -81,5 +83,59 @@ def collect():
             )
             td = root
         return td
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def start_tiny(library):
+    """Train for 60 vector steps of 6 worlds in a folder; return it.
+
+    Takes ``train`` and ``logger`` settings, and fields of Recipe.
+    """
+    from flashdex.recipe import LoggerConfig, MotionsConfig, validate
+    from flashdex.training.run import train as start
+
+    def run(folder, *, train=None, logger=None, **fields):
+        transforms = {**EnvConfig().transforms, "object_points": {"num_points": 4}}
+        settings = {"log_every_s": 0.2, "certify": False, "torch_threads": 1}
+        settings |= {"stop_when_all_converted": False}
+        recipe = dataclasses.replace(
+            Recipe(name="tiny", total_env_steps=360),
+            run_dir=str(folder),
+            motions=MotionsConfig(library=str(library.path)),
+            physics=PhysicsConfig(num_threads=1),
+            env=EnvConfig(
+                num_envs=6,
+                attempt_share=0.5,
+                finger_mode="residual",
+                transforms=transforms,
+            ),
+            algo=AlgoConfig(**{**TINY, "n_step": 2, "updates_per_step": 1.0}),
+            train=TrainConfig(**{**settings, **(train or {})}),
+            logger=LoggerConfig(**(logger or {})),
+            **fields,
+        )
+        return start(validate(recipe))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def tiny_runs():
+    """Finished runs by their settings, to be copied."""
+    return {}
+
+
+@pytest.fixture
+def train_tiny(start_tiny, tiny_runs, tmp_path, tmp_path_factory):
+    """A run of ``start_tiny`` that the test may spoil: a copy of one trained before."""
+
+    def run(**settings):
+        key = repr(settings)
+        if key not in tiny_runs:
+            folder = tmp_path_factory.mktemp("tiny") / "run"
+            tiny_runs[key] = start_tiny(folder, **settings)
+        return Path(shutil.copytree(tiny_runs[key], tmp_path / "run"))
 
     return run

@@ -1,0 +1,172 @@
+"""Everything a training session consists of, put together and restored."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.errors import RunError
+from flashdex.files import write_atomic
+from flashdex.recipe import dump_recipe
+from flashdex.training.baselines import score_baselines
+from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
+from flashdex.training.learner import Learner
+from flashdex.training.ledger import Ledger
+from flashdex.training.logging import MetricLog
+from flashdex.training.loop import Trainer
+from flashdex.training.replay_file import ReplayLog, replay_of
+from flashdex.training.sessions import Start, begin_session
+from flashdex.training.setup import Workbench
+
+_LOG = logging.getLogger(__name__)
+RECIPE, BASELINES = "recipe.yaml", "baselines.json"
+
+
+def make_trainer(
+    bench: Workbench,
+    run_dir: Path,
+    state: dict[str, Any] | None,
+    overrides: list[str],
+) -> Trainer:
+    """Build the trainer of a session, and write the session's first line.
+
+    Args:
+        bench: motions and recipe, overrides included.
+        run_dir: run directory, locked.
+        state: checkpoint to go on from, or None.
+        overrides: what the recipe was changed by.
+
+    Raises:
+        RunError: the checkpoint does not fit the recipe; nothing is changed then.
+    """
+    recipe = bench.recipe
+    env = bench.make_env()
+    learner = bench.make_learner(env)
+    if state is not None:
+        _restore(learner, state)
+    if overrides:
+        write_atomic(run_dir / RECIPE, dump_recipe(recipe))
+        (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
+    ledger = _open_ledger(bench, run_dir)
+    start = begin_session(
+        run_dir,
+        env_steps=state["env_steps"] if state else 0,
+        wall_s=state["wall_s"] if state else 0.0,
+        overrides=overrides,
+    )
+    _check_ledger(ledger, state, start)
+    trainer = _join(bench, run_dir, env, learner, ledger, start, state)
+    if state is not None:
+        trainer.load_state_dict(state)
+    return trainer
+
+
+def _open_ledger(bench: Workbench, run_dir: Path) -> Ledger:
+    recipe = bench.recipe
+    baselines = score_baselines(bench, run_dir / BASELINES)
+    return Ledger(
+        run_dir,
+        bench.bank.names,
+        criterion=recipe.train.criterion,
+        seed=recipe.seed,
+        engine=recipe.physics.engine,
+        certify=recipe.train.certify,
+        trivial=baselines.trivial(recipe.train.criterion),
+    )
+
+
+def _join(
+    bench: Workbench,
+    run_dir: Path,
+    env: TrackingEnv,
+    learner: Learner,
+    ledger: Ledger,
+    start: Start,
+    state: dict[str, Any] | None,
+) -> Trainer:
+    log = MetricLog(
+        run_dir,
+        bench.recipe,
+        wandb_id=state["wandb_id"] if state else None,
+        env_steps=start.env_steps,
+    )
+    return Trainer(
+        bench.recipe,
+        run_dir,
+        env,
+        learner,
+        ledger,
+        log,
+        start=start,
+        replay=_open_replay(bench, run_dir, learner, state),
+        provenance=_provenance(bench),
+    )
+
+
+def _provenance(bench: Workbench) -> dict[str, str]:
+    """Where a rollout comes from, apart from the versions stored with it."""
+    manifest = (bench.library.path / "manifest.json").read_bytes()
+    return {
+        "recipe_sha256": hashlib.sha256(dump_recipe(bench.recipe).encode()).hexdigest(),
+        "library_sha256": hashlib.sha256(manifest).hexdigest(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _restore(learner: Learner, state: dict[str, Any]) -> None:
+    try:
+        learner.load_state_dict(state["learner"])
+    except (RuntimeError, KeyError) as error:
+        lines = [line.strip() for line in str(error).splitlines()]
+        fault = " ".join(lines[:2])
+        raise RunError(
+            "the checkpoint does not fit the recipe: an override changed the networks, "
+            "the observation or env.num_envs, or another version of flashdex wrote it "
+            f"({fault}{' ...' if len(lines) > 2 else ''}). Resume without the override "
+            "or with that version, or start a new run."
+        ) from error
+    learner.forget_episodes()
+
+
+def _check_ledger(ledger: Ledger, state: dict[str, Any] | None, start: Start) -> None:
+    """Say what the ledger lost, and take in what a crash left without a line."""
+    if state is not None and ledger.num_bytes < state["ledger_bytes"]:
+        _LOG.warning(
+            "%s is shorter than at the checkpoint: attempts are missing", ledger.path
+        )
+    for name in ledger.adopt(wall_s=start.wall_s):
+        _LOG.info("%s: its stored rollout had no line yet, and has one now", name)
+
+
+def _open_replay(
+    bench: Workbench, run_dir: Path, learner: Learner, state: dict[str, Any] | None
+) -> ReplayLog | None:
+    """The files of the replay buffer, and its rows as they were at the checkpoint."""
+    buffer = replay_of(learner)
+    if buffer is None:
+        return None
+    recipe = bench.recipe
+    rows = {
+        "library": _provenance(bench)["library_sha256"],
+        "motions": bench.bank.names,
+        "env": dataclasses.asdict(recipe.env),
+        "physics": dataclasses.asdict(recipe.physics),
+        "return": [recipe.algo.n_step, recipe.algo.gamma],
+    }
+    text = json.dumps(rows, sort_keys=True)
+    log = ReplayLog(
+        run_dir,
+        buffer,
+        meaning=hashlib.sha256(text.encode()).hexdigest(),
+        enabled=recipe.train.checkpoint_replay,
+    )
+    log.prune(checkpoint_names(run_dir))
+    if state is not None and log.load(checkpoint_name(state["env_steps"])):
+        _LOG.info("%d replay rows are back", len(buffer))
+    return log

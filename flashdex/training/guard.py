@@ -1,0 +1,151 @@
+"""Numbers that are not finite: found before they reach rows, weights or checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.utils import get_total_norm
+from torch.optim import Optimizer
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+if TYPE_CHECKING:
+    from flashdex.training.learner import Learner
+
+# Raw simulator states, which may hold anything once a world diverges.
+RAW = frozenset({"nstep"})
+
+
+class NonFiniteError(Exception):
+    """A gradient, loss or weight is NaN or infinite."""
+
+
+def finite_rows(row: TensorDictBase) -> Tensor:
+    """Rows of n-step windows that may be learnt from, (N,) bool.
+
+    Reward, action and state are finite, and so is the state at the window's end unless
+    the window ends in a true termination: nothing is bootstrapped from that one, and
+    packing replaces what is not finite in it.
+
+    Args:
+        row: state, action, reward, next_state and terminated, batch (N,).
+    """
+    own = {k: row.get(k) for k in ("state", "action", "reward")}
+    after = _all_finite(row.get("next_state")) | row.get("terminated").squeeze(-1)
+    for value in own.values():
+        after = after & _all_finite(value)
+    return after
+
+
+def _all_finite(value: Tensor | TensorDictBase) -> Tensor:
+    leaves = value.values(True, True) if isinstance(value, TensorDictBase) else [value]
+    floats = [leaf.flatten(1) for leaf in leaves if leaf.is_floating_point()]
+    return torch.cat(floats, -1).isfinite().all(-1)
+
+
+def first_non_finite(state: Any, path: str = "") -> str:
+    """Path of the first tensor or number that is not finite, empty when all are.
+
+    Args:
+        state: nested dicts, lists and tuples; keys of raw simulator states are skipped.
+        path: of ``state`` itself.
+    """
+    if isinstance(state, Mapping | TensorDictBase):
+        items = [(k, v) for k, v in state.items() if k not in RAW]
+    elif isinstance(state, list | tuple):
+        items = list(enumerate(state))
+    elif isinstance(state, Tensor):
+        bad = state.is_floating_point() and not bool(state.isfinite().all())
+        return path if bad else ""
+    else:
+        bad = isinstance(state, float) and not -float("inf") < state < float("inf")
+        return path if bad else ""
+    found = (first_non_finite(v, f"{path}.{k}".lstrip(".")) for k, v in items)
+    return next((f for f in found if f), "")
+
+
+@contextmanager
+def numeric_errors(learner: Learner) -> Iterator[None]:
+    """Tell a RuntimeError that stems from NaN from other ones.
+
+    The projection of a target indexes with what the networks say, and fails on NaN
+    before there is any gradient.
+
+    Args:
+        learner: performs an update inside the block.
+
+    Raises:
+        NonFiniteError: an error came up, and its batch or its state is not finite.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        batch = getattr(learner, "last_update", None)
+        if first_non_finite([batch, learner.state_dict()]):
+            raise NonFiniteError(str(error).splitlines()[0]) from error
+        raise
+
+
+class GradientGuard:
+    """Looks at the gradients before every optimiser step inside the ``with`` block.
+
+    On a CPU a gradient that is not finite raises before the step, so the weights are
+    those before it. On a GPU nothing waits for the device: fused optimisers skip the
+    step there by themselves, and ``check`` raises when it is next called.
+
+    Args:
+        waits: raise at once on a GPU, too, at the price of waiting for it; and False
+            never raises at once.
+    """
+
+    def __init__(self, *, waits: bool | None = None) -> None:
+        self.waits = waits
+        self._flag: Tensor | None = None
+
+    def __enter__(self) -> GradientGuard:
+        self._handle = register_optimizer_step_pre_hook(self._look)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._handle.remove()
+
+    @torch.no_grad()
+    def _look(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
+        parameters = [p for g in optimizer.param_groups for p in g["params"]]
+        grads = [p.grad for p in parameters if p.grad is not None]
+        if not grads:
+            return
+        # finite only if every entry is
+        total = get_total_norm(grads)
+        waits = total.device.type == "cpu" if self.waits is None else self.waits
+        if waits:
+            if not bool(total.isfinite()):
+                raise NonFiniteError(_describe(parameters))
+            return
+        bad = (~total.isfinite()).float()
+        if optimizer.param_groups[0].get("fused"):
+            optimizer.found_inf = bad  # type: ignore[attr-defined]
+        self._flag = bad if self._flag is None else torch.maximum(self._flag, bad)
+
+    def check(self) -> None:
+        """Raise if a step was skipped since the beginning; waits for the device."""
+        if self._flag is not None and bool(self._flag):
+            msg = "gradient (the step was skipped on the device)"
+            raise NonFiniteError(msg)
+
+
+def _describe(parameters: list[Tensor]) -> str:
+    for number, p in enumerate(parameters):
+        if p.grad is not None and not bool(p.grad.isfinite().all()):
+            return f"gradient of parameter {number}, {tuple(p.shape)}"
+    return "norm of the gradients"

@@ -1,0 +1,168 @@
+"""FlashSAC on plain observations and actions: replay around the agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flashdex import keys
+from flashdex.recipe import AlgoConfig
+from flashdex.training.agent import FlashSACAgent
+from flashdex.training.nstep import NStepAssembler
+
+NEXT_OBSERVATION = "next_observation"
+
+
+class GymLearner:
+    """FlashSAC for one agent; see `flashdex.training.learner.Learner`.
+
+    A state is a TensorDict (N,) with the ``observation`` (N, D); actions are (N, A) in
+    [-1, 1] and rewards (N, 1).
+
+    Args:
+        config: algorithm part of the recipe.
+        observation_dim: D.
+        action_dim: A.
+        num_envs: worlds N that are collected from.
+        total_updates: horizon of the learning-rate schedule.
+        seed: of networks, exploration and replay.
+    """
+
+    def __init__(
+        self,
+        config: AlgoConfig,
+        *,
+        observation_dim: int,
+        action_dim: int,
+        num_envs: int,
+        total_updates: int,
+        seed: int,
+    ) -> None:
+        self.config = config
+        self.generator = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)  # initial weights are drawn from the global stream
+        self.agent = FlashSACAgent(
+            config,
+            observation_dim=observation_dim,
+            action_dim=action_dim,
+            num_envs=num_envs,
+            total_updates=total_updates,
+            generator=self.generator,
+        )
+        self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(config.buffer_size),
+            batch_size=config.batch_size,
+            generator=self.generator,
+        )
+        self._debt = 0.0
+
+    @property
+    def ready(self) -> bool:
+        """Whether the replay buffer holds enough rows to learn from."""
+        return len(self.buffer) >= self.config.min_buffer
+
+    @property
+    def updates(self) -> int:
+        """Critic updates performed so far."""
+        return self.agent.stepper.updates
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of the replay buffer."""
+        return len(self.buffer)
+
+    def due(self) -> int:
+        """Updates to perform now; a fraction is carried to the next vector step."""
+        if not self.ready:
+            return 0
+        self._debt += self.config.updates_per_step
+        whole = int(self._debt)
+        self._debt -= whole
+        return whole
+
+    @torch.no_grad()
+    def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
+        """Actions, (N, A).
+
+        Args:
+            state: holds the observation, (N, D).
+            explore: with noise; before there are rows to learn from, at random.
+        """
+        # A resumed learner may start with an empty buffer, but not without a policy.
+        trained = self.ready or self.updates > 0 or self.config.warmup == "policy"
+        if explore and not trained:
+            shape = (state.batch_size[0], self.agent.actor.action_dim)
+            return 2 * torch.rand(shape, generator=self.generator) - 1
+        kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+        with set_exploration_type(kind):
+            return self.agent.policy(state.copy())[keys.ACTION]
+
+    def remember(
+        self,
+        state: TensorDictBase,
+        action: Tensor,
+        reward: Tensor,
+        next_state: TensorDictBase,
+        terminated: Tensor,
+        done: Tensor,
+    ) -> None:
+        """Update the reward statistics and store what the n-step window yields."""
+        self.agent.normalizer.update(reward, done)
+        row = self.nstep.push(state, action, reward, next_state, terminated, done)
+        if row is None:
+            return
+        flat = {
+            keys.OBSERVATION: row["state", keys.OBSERVATION],
+            NEXT_OBSERVATION: row["next_state", keys.OBSERVATION],
+            keys.ACTION: row["action"],
+            keys.REWARD: row["reward"],
+            keys.TERMINATED: row["terminated"],
+            keys.STEPS: row["steps"].to(torch.int16),
+        }
+        self.buffer.extend(TensorDict(flat, batch_size=row.batch_size))
+
+    def sample(self) -> TensorDict:
+        """A replay sample as the loss reads it, batch (B,)."""
+        row = self.buffer.sample()
+        return TensorDict(
+            {
+                keys.OBSERVATION: row[keys.OBSERVATION],
+                keys.ACTION: row[keys.ACTION],
+                keys.STEPS: row[keys.STEPS],
+                "next": {
+                    keys.OBSERVATION: row[NEXT_OBSERVATION],
+                    keys.REWARD: row[keys.REWARD],
+                    keys.TERMINATED: row[keys.TERMINATED],
+                },
+            },
+            batch_size=row.batch_size,
+        )
+
+    def update(self) -> TensorDict:
+        """One FlashSAC update on a fresh sample; returns its metrics."""
+        return self.agent.update(self.sample())
+
+    def forget_episodes(self) -> None:
+        """Drop the open n-step window and the running returns."""
+        self.nstep.clear()
+        self.agent.normalizer.clear_returns()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Agent, n-step tail and update debt; the replay rows are not part of it."""
+        return {
+            "agent": self.agent.state_dict(),
+            "nstep": self.nstep.state_dict(),
+            "debt": self._debt,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore ``state_dict``."""
+        self.agent.load_state_dict(state["agent"])
+        self.nstep.load_state_dict(state["nstep"])
+        self._debt = state["debt"]

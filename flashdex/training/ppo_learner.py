@@ -1,0 +1,274 @@
+"""PPO on the tracking environment: one learner a hand, rollouts of compact states."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+
+from flashdex import keys
+from flashdex.envs.reference import ReferenceBank
+from flashdex.errors import RunError
+from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
+from flashdex.objectives.ppo import PPO, bootstrap_rows
+from flashdex.objectives.reward_normalizer import RewardNormalizer
+from flashdex.recipe import AlgoConfig
+from flashdex.training.agent import make_encoder
+from flashdex.training.hand_groups import HandGroups
+from flashdex.training.ppo_inputs import PPOInputs
+
+STEP = ("action", "reward", "finite", "terminated", "done")
+
+
+class PPOLearner:
+    """The paper's PPO baseline; see `flashdex.training.learner.Learner`.
+
+    Each group of hands is a PPO learner of its own on the common observation. Attempt
+    worlds act deterministically and are not learnt from: their actions are not samples
+    of the policy. Nor are steps of a motion that a hand takes no part in.
+
+    Rewards are scaled as FlashSAC's are, by the running spread of the discounted
+    return, so that both learners see the same numbers.
+
+    Args:
+        config: algorithm part of the recipe.
+        transforms: observation transforms in data-flow order.
+        bank: reference frames.
+        example: one compact state, batch (N,), that fixes the network sizes.
+        seed: of networks, actions and minibatches.
+    """
+
+    def __init__(
+        self,
+        config: AlgoConfig,
+        transforms: list[Transform],
+        bank: ReferenceBank,
+        example: TensorDictBase,
+        *,
+        seed: int,
+    ) -> None:
+        self.config, self.bank = config, bank
+        self.groups = HandGroups.of(bank, unified=config.groups == "unified")
+        self.generator = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)
+        self.inputs = PPOInputs(transforms, self.groups, example)
+        self.agents = {
+            name: make_ppo(config, self.inputs, self.groups.action_dim, self.generator)
+            for name in self.groups.names
+        }
+        self.normalizer = RewardNormalizer(
+            example.batch_size[0],
+            len(self.groups.names),
+            gamma=config.gamma,
+            bound=config.v_max,
+        )
+        self.num_dropped = 0  # steps whose reward was not finite
+        self._updates = 0
+        self._rollout: list[TensorDict] = []
+
+    @torch.no_grad()
+    def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
+        """Actions of both hands, (N, 2, J); attempt worlds act deterministically.
+
+        Samples are not clipped, so that their log-probability is that of the Gaussian;
+        the environment clips.
+
+        Args:
+            state: compact state, batch (N,), with the ``attempt`` flag.
+            explore: False makes every world deterministic.
+        """
+        inputs = self.inputs(state)
+        quiet = self._join(inputs, explore=False).clamp(-1.0, 1.0)
+        if not explore:
+            return quiet
+        noisy = self._join(inputs, explore=True)
+        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), quiet, noisy)
+
+    def _join(self, inputs: TensorDict, *, explore: bool) -> Tensor:
+        actions = TensorDict({}, inputs.batch_size)
+        for name, agent in self.agents.items():
+            actions.set((name, keys.ACTION), agent.act(inputs, explore=explore))
+        return self.groups.join(actions)
+
+    def remember(
+        self,
+        state: TensorDictBase,
+        action: Tensor,
+        reward: Tensor,
+        next_state: TensorDictBase,
+        terminated: Tensor,
+        done: Tensor,
+    ) -> None:
+        """Update the reward statistics and append the training worlds to the rollout.
+
+        Steps whose reward is not finite are counted and not learnt from.
+
+        Args:
+            state: compact state before the step, batch (N,).
+            action: what ``act`` returned, (N, 2, J).
+            reward: per hand, (N, 2).
+            next_state: compact state after the step, before any reset.
+            terminated: (N, 1) bool.
+            done: (N, 1) bool.
+        """
+        train = ~state[keys.ATTEMPT]
+        active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
+        reward = self.groups.rewards(reward)
+        finite = reward.isfinite()
+        self.num_dropped += int((~finite & train).any(-1).sum())
+        reward = torch.where(finite, reward, 0.0)
+        counts = self.groups.mask(active) & train & finite
+        self.normalizer.update(reward, done, counts)
+        step = TensorDict(
+            {
+                "state": state.select(*keys.STATE),
+                "next_state": next_state.select(*keys.STATE),
+                "action": action,
+                "finite": finite,
+                "reward": reward,
+                "terminated": terminated,
+                "done": done,
+            },
+            [len(action)],
+        )
+        self._rollout.append(cast(TensorDict, step[train.squeeze(-1)]))
+
+    def due(self) -> int:
+        """1 once the rollout is full; the first one only sets the input statistics."""
+        if len(self._rollout) < self.config.ppo.horizon:
+            return 0
+        if self.inputs.fitted:
+            return 1
+        rollout = self._stacked().reshape(-1)
+        self.inputs.track(self.inputs.raw(rollout.get("state")))
+        self._rollout.clear()
+        return 0
+
+    def _stacked(self) -> TensorDict:
+        return cast(TensorDict, TensorDict.stack(self._rollout, 1))  # (N, T)
+
+    def batches(self) -> tuple[dict[str, TensorDict], TensorDict, TensorDict]:
+        """What the groups learn from in the present rollout.
+
+        Returns:
+            rows of each group, (N, T), and their tail, both as
+            `flashdex.objectives.ppo.PPO` wants them; the raw inputs, (N T,).
+        """
+        rollout = self._stacked()
+        size = rollout.batch_size
+        steps: dict[str, Tensor] = {key: rollout[key] for key in STEP}
+        raw = self.inputs.raw(rollout.get("state").reshape(-1))
+        inputs: Any = self.inputs.scaled(raw).unflatten(0, size)
+        # Elsewhere the next state is the state of the next row.
+        ends = bootstrap_rows(steps["done"].squeeze(-1))
+        tail = self.inputs(rollout.get("next_state")[ends])
+        joint = steps["action"].flatten(-2).flatten(0, 1)
+        actions = self.groups.actions(joint)
+        active: Any = raw[keys.GROUP_MASK]
+        mask = active.unflatten(0, size) & steps["finite"]
+        reward = steps["reward"] / self.normalizer.denominator()
+        found = {}
+        for i, name in enumerate(self.groups.names):
+            one = slice(i, i + 1)
+            after = {"reward": reward[..., one]}
+            after.update({key: steps[key] for key in ("terminated", "done")})
+            values: dict[str, Any] = dict(inputs.items())
+            values["action"] = actions[i].unflatten(0, size)
+            values["mask"] = mask[..., one]
+            found[name] = TensorDict({**values, "next": TensorDict(after, size)}, size)
+        return found, tail, raw
+
+    def update(self) -> TensorDict:
+        """Learn from the rollout, all epochs, and drop it; returns the metrics."""
+        batches, tail, raw = self.batches()
+        self._rollout.clear()
+        report = TensorDict({}, [])
+        for name, agent in self.agents.items():
+            report.set(name, agent.learn(batches[name], tail))
+        self.inputs.track(raw)  # only now: the rollout was collected with the old ones
+        self._updates += 1
+        return report
+
+    @property
+    def updates(self) -> int:
+        """Rollouts learnt from so far."""
+        return self._updates
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of the open rollout."""
+        return sum(len(step) for step in self._rollout)
+
+    def forget_episodes(self) -> None:
+        """Drop the open rollout and the running returns."""
+        self._rollout.clear()
+        self.normalizer.clear_returns()
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of all but the open rollout."""
+        state = {
+            "agents": {name: a.state_dict() for name, a in self.agents.items()},
+            "inputs": self.inputs.state_dict(),
+            "normalizer": self.normalizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "updates": self._updates,
+            "dropped": self.num_dropped,
+        }
+        return copy.deepcopy(state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore ``state_dict``; the rollout begins anew.
+
+        Raises:
+            RunError: the state is that of another algorithm or of other groups.
+        """
+        if set(state.get("agents", ())) != set(self.agents):
+            raise RunError(
+                "the checkpoint is not one of PPO with the groups "
+                f"{', '.join(self.agents)}: an override changed algo.kind or "
+                "algo.groups. Resume without it, or start a new run."
+            )
+        state = copy.deepcopy(state)  # Adam keeps the very tensors it is given
+        for name, agent in self.agents.items():
+            agent.load_state_dict(state["agents"][name])
+        self.inputs.load_state_dict(state["inputs"])
+        self.normalizer.load_state_dict(state["normalizer"])
+        self.generator.set_state(state["generator"])
+        self._updates = state["updates"]
+        self.num_dropped = state["dropped"]
+        self._rollout.clear()
+
+
+def make_ppo(
+    config: AlgoConfig, inputs: PPOInputs, action_dim: int, generator: torch.Generator
+) -> PPO:
+    """Networks, loss and optimiser of one group."""
+    ppo, width, shape = config.ppo, inputs.observation_dim, inputs.future_shape
+    policy = GaussianPolicy(
+        width,
+        action_dim,
+        hidden=ppo.hidden,
+        init_std=ppo.init_std,
+        encoder=make_encoder(config, shape, 1),
+    )
+    value = ValueNet(width, hidden=ppo.hidden, encoder=make_encoder(config, shape, 1))
+    return PPO(
+        policy,
+        value,
+        gamma=config.gamma,
+        gae_lambda=ppo.gae_lambda,
+        clip=ppo.clip,
+        value_clip=ppo.value_clip,
+        value_coef=ppo.value_coef,
+        entropy_coef=ppo.entropy_coef,
+        lr=ppo.lr,
+        target_kl=ppo.target_kl,
+        max_grad_norm=ppo.max_grad_norm,
+        epochs=ppo.epochs,
+        minibatches=ppo.minibatches,
+        generator=generator,
+    )

@@ -1,0 +1,108 @@
+"""Sessions of a run: what a crash cost, and that its time is counted all the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flashdex.training.jsonl import append_line, drop_cut_line, read_lines
+from flashdex.training.ledger import CONVERSIONS
+from flashdex.training.logging import METRICS
+
+SESSIONS = "sessions.jsonl"
+SIGNAL = "signal"  # why a session ended, when a person or a scheduler ended it
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a session begins.
+
+    Attributes:
+        env_steps: of the checkpoint, 0 without one.
+        wall_s: seconds of the run so far, those after the checkpoint included.
+        lost: env steps of all sessions that no checkpoint kept.
+    """
+
+    env_steps: int
+    wall_s: float
+    lost: int
+
+
+def begin_session(
+    run_dir: Path, *, env_steps: int, wall_s: float, overrides: list[str]
+) -> Start:
+    """Work out where a session begins and write its ``start`` line.
+
+    The counters go back to the checkpoint. The clock does not: it goes on from the
+    latest moment that any file of the run knows of. Env steps beyond the checkpoint
+    were simulated for nothing and are added up.
+
+    Args:
+        run_dir: run directory.
+        env_steps: counter of the checkpoint.
+        wall_s: clock of the checkpoint, s.
+        overrides: changes that the session was started with.
+    """
+    drop_cut_line(run_dir / SESSIONS)
+    before = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "start"]
+    since = before[-1]["wall_s"] if before else 0.0
+    seen = _seen(run_dir)
+    # What an earlier resume has counted already was written before that resume.
+    reached = [steps for steps, wall in seen if wall > since]
+    lost = max(0, max(reached, default=0) - env_steps)
+    start = Start(
+        env_steps=env_steps,
+        wall_s=max([wall_s, since, *(wall for _, wall in seen)]),
+        lost=lost + (before[-1]["env_steps_lost"] if before else 0),
+    )
+    line = {
+        "event": "start",
+        "date": _now(),
+        "env_steps": env_steps,
+        "wall_s": start.wall_s,
+        "env_steps_lost": start.lost,
+        "overrides": overrides,
+    }
+    append_line(run_dir / SESSIONS, line)
+    return start
+
+
+def end_session(run_dir: Path, why: str, *, env_steps: int, wall_s: float) -> None:
+    """Write the ``end`` line; a session without one crashed, or is running.
+
+    Args:
+        run_dir: run directory.
+        why: what ended it.
+        env_steps: counter at the end.
+        wall_s: clock at the end, s.
+    """
+    line = {
+        "event": "end",
+        "date": _now(),
+        "env_steps": env_steps,
+        "wall_s": wall_s,
+        "why": why,
+    }
+    append_line(run_dir / SESSIONS, line)
+
+
+def ended_by(run_dir: Path) -> str:
+    """Why the newest session ended, empty when it has not."""
+    lines = read_lines(run_dir / SESSIONS)
+    return lines[-1].get("why", "") if lines else ""
+
+
+def _seen(run_dir: Path) -> list[tuple[int, float]]:
+    """Env steps and clock, s, of every record of a run."""
+    metrics: list[dict[str, Any]] = read_lines(run_dir / METRICS)
+    out = [(int(r["env_steps"]), 3600.0 * r["hours"]) for r in metrics]
+    lines = read_lines(run_dir / CONVERSIONS)
+    out += [(int(r["env_steps"]), float(r["wall_s"])) for r in lines]
+    ends = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "end"]
+    return out + [(int(s["env_steps"]), float(s["wall_s"])) for s in ends]
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

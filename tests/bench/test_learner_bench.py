@@ -1,0 +1,102 @@
+"""The plain learner of the benchmark and the library's compute the same thing."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from flashdex.bench import learner as bench
+from flashdex.bench.learner_sizes import LearnerSize, make_batch, make_loss, make_plain
+from flashdex.bench.products import Product, profile_products, replay_seconds
+from flashdex.modules.product import multiply
+from flashdex.objectives.stepper import FlashSACStepper
+
+ONE = LearnerSize(9, 3, 1, 32, 24, 16)
+TWO = LearnerSize(9, 3, 2, 32, 16, 16, future=5, latent=6, channels=(8, 7, 6))
+
+
+@pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
+def dtype(request):
+    torch.set_default_dtype(request.param)
+    yield request.param
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("size", [ONE, TWO], ids=["one group", "two groups, future"])
+def test_both_learners_agree_over_several_updates(size, dtype):
+    """float64 is exact; in float32 Adam turns rounding into steps of its rate."""
+    tolerance = {"rtol": 1e-9, "atol": 1e-9}
+    if dtype == torch.float32:
+        tolerance = {"rtol": 1e-3, "atol": 1e-4}
+    torch.manual_seed(0)
+    loss = make_loss(size)
+    plain = make_plain(size, loss)
+    stepper = FlashSACStepper(loss)
+    groups = [f"group{g}" for g in range(size.groups)]
+    for seed in range(6):
+        td, batch = make_batch(size, seed=seed)
+        noise = {
+            name: torch.randn(size.groups, size.batch, size.action)
+            for name in ("actor_noise", "target_noise")
+        }
+        found = stepper.update(td, **noise)
+        wanted = plain.update(batch, **noise)
+        ours = {
+            # the actor loss is a sum over the groups, the critic loss a mean
+            "loss_actor": sum(found[group, "loss_actor"] for group in groups),
+            "loss_qvalue": sum(found[group, "loss_qvalue"] for group in groups)
+            / len(groups),
+            "alpha": torch.stack([found[group, "alpha"] for group in groups]),
+        }
+        for name, value in wanted.items():
+            torch.testing.assert_close(ours[name], value, **tolerance)
+    for index, trunk in enumerate(plain.target.trunks):
+        norm = loss.target_qvalue_network.trunk.blocks[1].norm2
+        plain_norm = trunk.blocks[1].norm2
+        torch.testing.assert_close(norm.running_var[index], plain_norm.var, **tolerance)
+        torch.testing.assert_close(
+            norm.running_mean[index], plain_norm.mean, **tolerance
+        )
+
+
+def test_main_prints_one_json_object_a_size(monkeypatch, capsys):
+    monkeypatch.setitem(bench.SIZES, "tiny", TWO)
+    before = torch.get_num_threads()
+    out = bench.main(["--sizes", "tiny", "--rounds", "2", "--threads", "1"])
+    assert torch.get_num_threads() == before
+    printed = capsys.readouterr().out.strip().splitlines()
+    assert [json.loads(line) for line in printed] == out
+    (result,) = out
+    wanted = {"benchmark", "hardware", "commit", "torch", "torch_threads", "split"}
+    wanted |= {"ms_per_update_eager", "baseline_ms_per_update", "ratio_to_baseline"}
+    assert wanted <= result.keys()
+    assert result["ratio_to_baseline"] == result["ratio_to_baseline_eager"] > 0
+    assert set(result["split"]) == {"read", "actor", "critic", "step"}
+    assert 0 < result["matmul_share"] < 1
+    assert 0 < result["gflops"] < result["ceiling_gflops"]
+
+
+def test_products_are_counted_from_shapes():
+    """5 x 7 by 7 x 3, the gradient of its left side, a batch of two, a large one."""
+    left, right = torch.randn(5, 7, requires_grad=True), torch.randn(7, 3)
+    batch = torch.randn(2, 4, 6), torch.randn(2, 6, 8)
+    x, weight = torch.randn(1, 160, 150), torch.randn(1, 140, 150)
+
+    def call():
+        (left @ right).sum().backward()
+        torch.bmm(*batch)
+        multiply(x, weight)
+
+    call()
+    found = profile_products(call, repeat=3)
+    assert found.counts == {
+        Product(1, 5, 7, 3): 1,
+        Product(1, 5, 3, 7): 1,
+        Product(2, 4, 6, 8): 1,
+        Product(1, 160, 150, 140): 1,
+    }
+    assert found.flops == 2 * (2 * 105 + 2 * 192 + 160 * 150 * 140)
+    assert 0 < found.share < 1
+    assert replay_seconds(found, repeat=3) > 0

@@ -1,0 +1,47 @@
+"""Work beside a block: order, errors, and a learner that cannot tell."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from flashdex.training.alongside import Alongside
+
+
+@pytest.mark.parametrize("threaded", [True, False])
+def test_work_has_ended_when_the_block_is_left(threaded):
+    done = []
+    alongside = Alongside(threaded=threaded)
+    with alongside.run(lambda: done.append(threading.current_thread().name)):
+        pass
+    alongside.close()
+    assert len(done) == 1
+    assert done[0].startswith("learner") == threaded
+
+
+def test_both_run_at_the_same_time():
+    meet = threading.Barrier(2, timeout=20)  # breaks unless both sides come
+    with Alongside(threaded=True).run(meet.wait):
+        meet.wait()
+    assert not meet.broken
+
+
+@pytest.mark.parametrize("threaded", [True, False])
+def test_an_error_of_the_work_comes_out(threaded):
+    def work():
+        raise ArithmeticError("inside")
+
+    with (
+        pytest.raises(ArithmeticError, match="inside"),
+        Alongside(threaded=threaded).run(work),
+    ):
+        pass
+
+
+def test_an_error_of_the_block_is_shown_first():
+    def work():
+        raise ArithmeticError("inside")
+
+    with pytest.raises(KeyError), Alongside(threaded=True).run(work):
+        raise KeyError

@@ -9,6 +9,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from flashdex.envs.judge import Outcome
+    from flashdex.envs.tracking import TrackingEnv
 
 _TASK = ("object_points", "object_pose")
 _IMITATION = ("wrist_pos", "wrist_rot", "fingertip_pos")
@@ -29,6 +30,30 @@ class AssistEpoch:
         self._sums: dict[str, float] = {}
         self._count = 0.0
         self._ended = self._failed = 0
+
+    def step(
+        self,
+        env: TrackingEnv,
+        outcome: Outcome,
+        done: Tensor,
+        terminated: Tensor,
+        vector_steps: int,
+    ) -> None:
+        """Take in one vector step of ``env``; at the end of an epoch let it fade.
+
+        Args:
+            env: its assist may be None; then nothing happens.
+            outcome: rewards and masks of the step.
+            done: (N, 1) bool.
+            terminated: (N, 1) bool.
+            vector_steps: of the run, this one included.
+        """
+        if env.assist is None:
+            return
+        self.add(outcome, ~env.attempt, done, terminated)
+        ends = vector_steps % env.assist.config.epoch_steps == 0
+        if ends and env.assist.end_epoch(**self.pop()):
+            env.redraw_assist()
 
     def add(
         self, outcome: Outcome, assisted: Tensor, done: Tensor, terminated: Tensor

@@ -1,4 +1,4 @@
-"""The training loop: act, step, remember, learn, judge attempts, log."""
+"""The training loop: act, learn while the physics steps, judge, remember, log."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
-from flashdex.envs.judge import Outcome
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe, dump_recipe
+from flashdex.training.alongside import Alongside
 from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempts import AttemptRecorder
 from flashdex.training.checkpoint import save_checkpoint
@@ -79,6 +79,7 @@ class Trainer:
         self.stats = RunningStats()
         self.assist_epoch = AssistEpoch()
         self.guard = GradientGuard()
+        self.alongside = Alongside(threaded=recipe.train.overlap)
         self.stop = StopSignals()
         self.env_steps = start.env_steps
         self._vector_steps = 0
@@ -134,6 +135,7 @@ class Trainer:
                     last_save = time.monotonic()
         finally:
             bar.close()
+            self.alongside.close()
         return why
 
     def vector_step(self, td: TensorDictBase) -> TensorDictBase:
@@ -142,21 +144,22 @@ class Trainer:
             action = self.learner.act(td)
             for i, side in enumerate(keys.SIDES):
                 td.set(keys.action(side), action[:, i])
-        with self.stats.time("env"):
-            td = self.env.step(td)
-        after = td.get("next")
-        self.env_steps += self.env.num_envs
-        self._vector_steps += 1
-        self._judge(action, after)
+        # The updates read rows and write weights, the step does neither.
+        with self.alongside.run(self._learn):
+            with self.stats.time("env"):
+                td = self.env.step(td)
+            after = td.get("next")
+            self.env_steps += self.env.num_envs
+            self._vector_steps += 1
+            self._judge(action, after)
+        terminated, done = after[keys.TERMINATED], after[keys.DONE]
         with self.stats.time("remember"):
             reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
-            terminated, done = after[keys.TERMINATED], after[keys.DONE]
             self.learner.remember(td, action, reward, after, terminated, done)
         assert self.env.info is not None
         outcome = self.env.info.outcome
         self.stats.add_step(outcome, done, terminated)
-        self._learn()
-        self._assist_epoch(outcome, done, terminated)
+        self.assist_epoch.step(self.env, outcome, done, terminated, self._vector_steps)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
@@ -186,16 +189,6 @@ class Trainer:
         for _ in range(self.learner.due()):
             with self.stats.time("update"), numeric_errors(self.learner):
                 self.stats.add_update(self.learner.update())
-
-    def _assist_epoch(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
-        assist = self.env.assist
-        if assist is None:
-            return
-        self.assist_epoch.add(outcome, ~self.env.attempt, done, terminated)
-        if self._vector_steps % assist.config.epoch_steps == 0 and assist.end_epoch(
-            **self.assist_epoch.pop()
-        ):
-            self.env.redraw_assist()
 
     def _end_reason(self) -> str:
         train = self.recipe.train

@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 
 import pytest
+import torch
 
 from flashdex.training.alongside import Alongside
+from flashdex.training.checkpoint import load_checkpoint
 
 
 @pytest.mark.parametrize("threaded", [True, False])
@@ -45,3 +47,24 @@ def test_an_error_of_the_block_is_shown_first():
 
     with pytest.raises(KeyError), Alongside(threaded=True).run(work):
         raise KeyError
+
+
+def leaves(state):
+    if isinstance(state, dict):
+        return [x for v in state.values() for x in leaves(v)]
+    if isinstance(state, list | tuple):
+        return [x for v in state for x in leaves(v)]
+    return [state]
+
+
+def test_a_run_cannot_tell_whether_it_learnt_beside_the_physics(start_tiny, tmp_path):
+    states = []
+    for overlap in (True, False):
+        folder = tmp_path / str(overlap)
+        start_tiny(folder, train={"overlap": overlap})
+        states.append(leaves(load_checkpoint(folder)["learner"]))
+    one, two = states
+    assert len(one) == len(two)
+    for a, b in zip(one, two, strict=True):
+        same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+        assert same

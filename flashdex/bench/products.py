@@ -1,4 +1,4 @@
-"""Matrix products of a piece of code: how many, what share, and their ceiling."""
+"""Matrix products of a piece of code: which ones, and how fast they can be at best."""
 
 from __future__ import annotations
 
@@ -40,42 +40,29 @@ class Product:
         return 2 * self.members * self.rows * self.inner * self.columns
 
 
-@dataclass(frozen=True)
-class ProductProfile:
-    """What the profiler saw.
+def count_products(
+    call: Callable[[], object], *, repeat: int = 1
+) -> dict[Product, float]:
+    """How often each product runs in one call.
 
-    Attributes:
-        counts: how often each product ran in one call.
-        share: self time of the products over that of all operators.
-    """
-
-    counts: dict[Product, float]
-    share: float
-
-    @property
-    def flops(self) -> float:
-        """Operations of all products of one call."""
-        return sum(p.flops * count for p, count in self.counts.items())
-
-
-def profile_products(call: Callable[[], object], *, repeat: int) -> ProductProfile:
-    """Run ``call`` under the profiler.
+    The profiler gives their shapes only: its own records scatter the heap, and the
+    page faults that follow make every other operator look slower than it is.
 
     Args:
-        call: what to look at; run it before, so that nothing is set up here.
+        call: what to look at.
         repeat: calls.
     """
     with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as found:
         for _ in range(repeat):
             call()
-    counts: Counter[Product] = Counter()
-    spent = total = 0.0
-    for event in found.events() or []:
-        total += event.self_cpu_time_total
-        if event.name in _OPERANDS:
-            counts[_read(event)] += 1
-            spent += event.self_cpu_time_total
-    return ProductProfile({p: n / repeat for p, n in counts.items()}, spent / total)
+    events = found.events() or []
+    counts = Counter(_read(event) for event in events if event.name in _OPERANDS)
+    return {product: number / repeat for product, number in counts.items()}
+
+
+def total_flops(counts: dict[Product, float]) -> float:
+    """Operations of all products of one call."""
+    return sum(product.flops * count for product, count in counts.items())
 
 
 def _read(event: FunctionEvent) -> Product:
@@ -87,15 +74,15 @@ def _read(event: FunctionEvent) -> Product:
     return Product(members, left[-2], left[-1], columns)
 
 
-def replay_seconds(found: ProductProfile, *, repeat: int) -> float:
+def replay_seconds(counts: dict[Product, float], *, repeat: int) -> float:
     """Seconds that the products of one call take by themselves, each in a tight loop.
 
     Args:
-        found: the products.
+        counts: the products.
         repeat: runs of each product; the median counts.
     """
     total = 0.0
-    for product, count in found.counts.items():
+    for product, count in counts.items():
         left = torch.randn(product.members, product.rows, product.inner)
         right = torch.randn(product.members, product.columns, product.inner)
         times = []

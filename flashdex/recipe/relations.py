@@ -74,6 +74,8 @@ def replay_conflicts(
         num_envs: worlds.
         where: key that gives the worlds, for the message.
     """
+    if algo.kind == "ppo":
+        return []  # no replay
     problems = []
     if algo.min_buffer > algo.buffer_size:
         problems.append(

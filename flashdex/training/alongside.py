@@ -28,15 +28,18 @@ class Alongside:
         self._pool = ThreadPoolExecutor(1, "learner") if threaded else None
 
     @contextmanager
-    def run(self, work: Callable[[], None]) -> Iterator[None]:
+    def run(self, work: Callable[[], None] | None) -> Iterator[None]:
         """Do ``work`` beside the block; both have ended when the block is left.
 
         Args:
-            work: what to do.
+            work: what to do; None is nothing.
 
         Raises:
             BaseException: what ``work`` raised, unless the block raised first.
         """
+        if work is None:
+            yield
+            return
         if self._pool is None:
             work()
             yield

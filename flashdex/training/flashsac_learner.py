@@ -35,6 +35,8 @@ class FlashSACLearner:
         seed: of networks, exploration and replay.
     """
 
+    is_off_policy = True
+
     def __init__(
         self,
         config: AlgoConfig,

@@ -33,6 +33,8 @@ class GymLearner:
         seed: of networks, exploration and replay.
     """
 
+    is_off_policy = True
+
     def __init__(
         self,
         config: AlgoConfig,

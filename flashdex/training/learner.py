@@ -9,7 +9,14 @@ from torch import Tensor
 
 
 class Learner(Protocol):
-    """Acts, remembers and learns; knows states and actions, but no simulator."""
+    """Acts, remembers and learns; knows states and actions, but no simulator.
+
+    Attributes:
+        is_off_policy: it may learn between acting and remembering the outcome; an
+            on-policy learner must not change before the rollout is complete.
+    """
+
+    is_off_policy: bool
 
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
         """Actions of both hands, (N, 2, J); attempt worlds act deterministically.

@@ -145,7 +145,8 @@ class Trainer:
             for i, side in enumerate(keys.SIDES):
                 td.set(keys.action(side), action[:, i])
         # The updates read rows and write weights, the step does neither.
-        with self.alongside.run(self._learn):
+        beside = self._learn if self.learner.is_off_policy else None
+        with self.alongside.run(beside):
             with self.stats.time("env"):
                 td = self.env.step(td)
             after = td.get("next")
@@ -156,6 +157,8 @@ class Trainer:
         with self.stats.time("remember"):
             reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
             self.learner.remember(td, action, reward, after, terminated, done)
+        if not self.learner.is_off_policy:
+            self._learn()
         assert self.env.info is not None
         outcome = self.env.info.outcome
         self.stats.add_step(outcome, done, terminated)

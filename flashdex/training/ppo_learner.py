@@ -42,6 +42,8 @@ class PPOLearner:
         seed: of networks, actions and minibatches.
     """
 
+    is_off_policy = False
+
     def __init__(
         self,
         config: AlgoConfig,

@@ -40,7 +40,7 @@ def test_published_settings_of_one_cpu_environment():
     assert (algo.actor_period, algo.actor_delay, algo.head) == (2, 0, "unit")
     assert (algo.alpha_init, algo.target_std, algo.warmup) == (0.01, 0.15, "uniform")
     assert (algo.noise_max_repeat, algo.noise_exponent) == (16, 2)
-    assert algo.noise_clock == "shared"
+    assert (algo.noise_clock, algo.norm_warmup) == ("shared", False)
 
 
 def test_the_small_recipe_is_the_beginning_of_a_published_run():

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from flashdex.modules.product import multiply, multiply_rows
+from flashdex.modules.product import are_bfloat16, multiply, multiply_rows
 
 
 class _LinearNormRelu(torch.autograd.Function):
@@ -26,15 +26,16 @@ class _LinearNormRelu(torch.autograd.Function):
         beta: Tensor,
         eps: float,
         keep: slice,
+        lowered: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         if x.shape[-1] < weight.shape[1]:
             # W (x - mean x) = W x - mean(W x): centre on the narrow side
             mean = x.mean(1, keepdim=True)
             x = x - mean
             mean = multiply(mean, weight).squeeze(1)
-            centred = multiply(x, weight)
+            centred = multiply(x, weight, lowered=lowered)
         else:
-            centred = multiply(x, weight)
+            centred = multiply(x, weight, lowered=lowered)
             mean = centred.mean(1)
             centred.sub_(mean[:, None])
         var = centred.square().mean(1)
@@ -42,7 +43,7 @@ class _LinearNormRelu(torch.autograd.Function):
         scale = (gamma * rstd)[:, None]
         y = torch.addcmul(beta[:, None], centred[:, keep], scale).relu_()
         ctx.save_for_backward(x, weight, centred, y, gamma, rstd)
-        ctx.keep = keep
+        ctx.keep, ctx.lowered = keep, lowered
         ctx.mark_non_differentiable(mean, var)
         return y, mean, var
 
@@ -64,9 +65,11 @@ class _LinearNormRelu(torch.autograd.Function):
         )
         inner[:, ctx.keep].addcmul_(grad, scale[:, None])
         # the columns of `inner` have mean zero: centring x changes neither gradient
-        grad_x = multiply(inner, weight.mT) if ctx.needs_input_grad[0] else None
-        grad_weight = multiply_rows(inner, x)
-        return grad_x, grad_weight, correlation * rstd, grad_beta, None, None
+        grad_x, lowered = None, ctx.lowered
+        if ctx.needs_input_grad[0]:
+            grad_x = multiply(inner, weight.mT, lowered=lowered)
+        grad_weight = multiply_rows(inner, x, lowered=lowered)
+        return grad_x, grad_weight, correlation * rstd, grad_beta, None, None, None
 
 
 def linear_norm_relu(
@@ -92,4 +95,5 @@ def linear_norm_relu(
         Output (E, rows, d), mean (E, d) and biased variance (E, d) of ``z``.
     """
     keep = slice(None) if keep is None else keep
-    return _LinearNormRelu.apply(x, weight, gamma, beta, eps, keep)
+    lowered = are_bfloat16()
+    return _LinearNormRelu.apply(x, weight, gamma, beta, eps, keep, lowered)

@@ -26,6 +26,8 @@ class FlashPolicy(TensorDictModuleBase):
         observation: key of the observation, (N, D).
         future: key of the future window, (N, C, K), read if the actor has an encoder.
         action: name of the action inside its group.
+        quiet: key of a flag (N, 1); where it is true, actions are deterministic even
+            under RANDOM. None: no such flag.
     """
 
     def __init__(
@@ -37,8 +39,10 @@ class FlashPolicy(TensorDictModuleBase):
         observation: NestedKey = "observation",
         future: NestedKey = "future",
         action: str = "action",
+        quiet: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        self.quiet = quiet
         self.actor = actor
         self.noise = NoiseRepetition() if noise is None else noise
         self.has_future = actor.future_encoder is not None
@@ -57,7 +61,10 @@ class FlashPolicy(TensorDictModuleBase):
         inputs = [x.reshape(-1, *x.shape[len(batch) :]) for x in inputs]
         mean, std = self.actor(*inputs, mode="eval")
         if exploration_type() == ExplorationType.RANDOM:
-            mean = mean + std * self.noise(tuple(mean.shape)).to(mean.dtype)
+            noise = self.noise(tuple(mean.shape)).to(mean.dtype)
+            if self.quiet is not None:
+                noise = noise.masked_fill(tensordict.get(self.quiet).reshape(-1, 1), 0)
+            mean = mean + std * noise
         action = torch.tanh(mean)
         for key, value in zip(self.out_keys, action.unbind(0), strict=True):
             tensordict.set(key, value.reshape(*batch, -1))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
@@ -32,6 +32,7 @@ class FlashSACAgent:
         num_envs: worlds that are collected from.
         total_updates: horizon of the learning-rate schedule.
         generator: source of the exploration and policy noise.
+        quiet: key of the worlds that never explore, see `FlashPolicy`.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class FlashSACAgent:
         num_envs: int,
         total_updates: int,
         generator: torch.Generator,
+        quiet: NestedKey | None = None,
     ) -> None:
         self.config = config
         number = 1 if groups is None else len(groups)
@@ -87,7 +89,7 @@ class FlashSACAgent:
             clock=config.noise_clock,
             generator=generator,
         )
-        self.policy = FlashPolicy(self.actor, groups=groups, noise=noise)
+        self.policy = FlashPolicy(self.actor, groups=groups, noise=noise, quiet=quiet)
 
     def update(self, batch: TensorDictBase) -> TensorDict:
         """One FlashSAC update on a sampled batch; returns its metrics."""

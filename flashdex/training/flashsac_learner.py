@@ -64,6 +64,7 @@ class FlashSACLearner:
             num_envs=example.batch_size[0],
             total_updates=total_updates,
             generator=self.generator,
+            quiet=keys.ATTEMPT,
         )
         self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
         self.codec = RowCodec(bank)
@@ -112,18 +113,16 @@ class FlashSACLearner:
             explore: False makes every world deterministic.
         """
         shown = assemble(self.transforms, state)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            quiet = self.groups.join(self.agent.policy(shown.copy()))
-        if not explore:
-            return quiet
         # A resumed learner may start with an empty buffer, but not without a policy.
         trained = self.ready or self.updates > 0
-        if trained or self.config.warmup == "policy":
-            with set_exploration_type(ExplorationType.RANDOM):
-                noisy = self.groups.join(self.agent.policy(shown.copy()))
-        else:
-            noisy = 2 * torch.rand(quiet.shape, generator=self.generator) - 1
-        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), quiet, noisy)
+        by_policy = trained or self.config.warmup == "policy"
+        kind = ExplorationType.RANDOM if by_policy else ExplorationType.DETERMINISTIC
+        with set_exploration_type(kind if explore else ExplorationType.DETERMINISTIC):
+            action = self.groups.join(self.agent.policy(shown))
+        if by_policy or not explore:
+            return action
+        chance = 2 * torch.rand(action.shape, generator=self.generator) - 1
+        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), action, chance)
 
     def remember(
         self,

@@ -157,8 +157,7 @@ def _restore(learner: GymLearner, state: dict[str, Any]) -> None:
     except (RuntimeError, KeyError) as error:
         raise RunError(
             "the checkpoint does not fit the recipe: an override changed the networks, "
-            f"the environment or gym.num_envs ({error}). Resume without it, or start a "
-            "new run."
+            f"the environment or gym.num_envs, or another version wrote it ({error})."
         ) from error
     learner.forget_episodes()
 
@@ -178,7 +177,7 @@ def evaluate_gym(run: str | Path, overrides: list[str] | None = None) -> dict[st
     recipe = load_gym_recipe(run_dir, overrides)
     state = load_checkpoint(run_dir)
     learner = make_gym_learner(recipe)
-    learner.load_state_dict(state["learner"])
+    _restore(learner, state)
     found = evaluate_recipe(recipe, learner)
     result = {
         "env_id": recipe.gym.env_id,

@@ -79,7 +79,7 @@ def test_main_prints_one_json_object_a_size(monkeypatch, capsys):
     assert wanted <= result.keys()
     assert result["ratio_to_baseline"] == result["ratio_to_baseline_eager"] > 0
     assert set(result["split"]) == {"read", "actor", "critic", "step"}
-    # 6 layers forward and backward of two networks, at least once over all rows
+    # at least the blocks of the critics, forward, over both halves of the batch
     layers = 2 * TWO.batch * TWO.groups * 2 * 2 * 8 * TWO.critic**2 * 2
     assert result["gflop_per_update"] > layers / 1e9
     assert result["ceiling_ms_per_update"] > 0

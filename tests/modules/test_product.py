@@ -1,5 +1,7 @@
 """Products of members: the fast kernels, their fallbacks and their gradients."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
@@ -74,26 +76,37 @@ def test_what_needs_no_gradient_gets_none():
 
 def test_bfloat16_products_round_large_ones_and_end_with_their_block():
     x, weight, bias = _operands(SHAPES["large"])
-    exact = multiply(x, weight, bias)
+    exact = product(x, weight, bias)
     with bfloat16_products():
-        rounded = multiply(x, weight, bias)
+        rounded = product(x, weight, bias)
         with bfloat16_products(False):  # an inner block does not switch it off
-            assert torch.equal(multiply(x, weight, bias), rounded)
-    wanted = torch.einsum(
-        "ebk,edk->ebd", x.bfloat16().double(), weight.bfloat16().double()
-    )
-    assert torch.allclose(rounded.double(), wanted + bias[:, None], atol=0.2)
+            assert torch.equal(product(x, weight, bias), rounded)
+        with ThreadPoolExecutor(1) as other:
+            assert torch.equal(other.submit(product, x, weight, bias).result(), exact)
+    operands = x.bfloat16().double(), weight.bfloat16().double()
+    wanted = torch.einsum("ebk,edk->ebd", *operands) + bias[:, None]
+    assert torch.allclose(rounded.double(), wanted, atol=0.2)
     assert rounded.dtype == torch.float32
     assert not torch.equal(rounded, exact)
-    with bfloat16_products(False):
-        assert torch.equal(multiply(x, weight, bias), exact)
     with pytest.raises(RuntimeError), bfloat16_products():
         raise RuntimeError
-    assert torch.equal(multiply(x, weight, bias), exact)
+    assert torch.equal(product(x, weight, bias), exact)
+
+
+def test_gradients_are_rounded_as_their_product_was():
+    x, weight, _ = _operands(SHAPES["large"])
+    x.requires_grad_()
+    (exact,) = torch.autograd.grad(product(x, weight).sum(), x)
+    with bfloat16_products():
+        out = product(x, weight)
+    (rounded,) = torch.autograd.grad(out.sum(), x)
+    assert not torch.equal(exact, rounded)
+    wanted = weight.bfloat16().double().sum(1, keepdim=True).expand_as(rounded)
+    assert torch.allclose(rounded.double(), wanted, atol=0.2)
 
 
 def test_small_products_are_never_rounded():
     x, weight, bias = _operands(SHAPES["small"])
     with bfloat16_products():
-        out = multiply(x, weight, bias)
-    assert torch.equal(out, multiply(x, weight, bias))
+        out = product(x, weight, bias)
+    assert torch.equal(out, product(x, weight, bias))

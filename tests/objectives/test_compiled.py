@@ -34,7 +34,8 @@ def test_autocast_stays_near_float32():
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager_in_float32():
+@pytest.mark.parametrize(("autocast", "tolerance"), [(False, 1e-3), (True, 2e-2)])
+def test_compiled_equals_eager_in_float32(autocast, tolerance):
     torch.manual_seed(0)
     losses = [make_loss(SIZE) for _ in range(2)]
     losses[1].load_state_dict(losses[0].state_dict())
@@ -42,7 +43,7 @@ def test_compiled_equals_eager_in_float32():
     assert 2 * SIZE.batch * wide[0].numel() >= product._LARGE
     torch.compiler.reset()
     eager, compiled = (
-        FlashSACStepper(loss, compile=flag)
+        FlashSACStepper(loss, compile=flag, autocast=autocast)
         for loss, flag in zip(losses, (False, True), strict=True)
     )
     for seed in range(4):
@@ -52,4 +53,4 @@ def test_compiled_equals_eager_in_float32():
         a, b = eager.update(td, **noise), compiled.update(td, **noise)
         for key in a.keys(True, True):
             # Adam turns rounding into steps of its rate, 3e-4
-            torch.testing.assert_close(a[key], b[key], atol=1e-3, rtol=1e-3)
+            torch.testing.assert_close(a[key], b[key], atol=tolerance, rtol=tolerance)

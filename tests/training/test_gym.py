@@ -278,6 +278,8 @@ def test_changed_networks_do_not_resume(finished, capsys):
     words = ["--resume", str(finished), "algo.critic_width=24", "total_env_steps=200"]
     assert main(["train", *words]) == 2
     assert "does not fit the recipe" in capsys.readouterr().err
+    assert main(["evaluate", str(finished), "algo.critic_width=24"]) == 2
+    assert "does not fit the recipe" in capsys.readouterr().err
     assert (finished / "recipe.yaml").read_text() == before
 
 

@@ -53,7 +53,7 @@ def measure_recipe(
         for phase, values in times.items()
     }
     with torch.no_grad():
-        shown = learner.sample()
+        shown = learner.sample()[0]
     return {**split, "observation": shown[keys.OBSERVATION].shape[-1]}
 
 

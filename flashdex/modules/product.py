@@ -15,7 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_HAS_ONEDNN = torch.backends.mkldnn.is_available()
+_HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(
+    torch.ops.mkldnn, "_linear_pointwise"
+)
 # below this many multiplications a member start-up and casts cost more than they save
 _LARGE = 1 << 21
 _state = threading.local()

@@ -109,6 +109,8 @@ class AlgoConfig:
     """Exponent of the repetition lengths; larger repeats less."""
     noise_clock: Literal["shared", "per_env_hand"] = "shared"
     """All worlds and hands redraw their noise together, or each by its own clock."""
+    bfloat16: bool = False
+    """Large matrix products of the updates in bfloat16, everything else in float32."""
     compile: bool = False
     """Compile the updates (GPU); slow first minute, then faster."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)

@@ -82,6 +82,7 @@ class FlashSACAgent:
             tau=config.tau,
             generator=generator,
             compile=config.compile,
+            autocast=config.bfloat16,
         )
         noise = NoiseRepetition(
             exponent=config.noise_exponent,

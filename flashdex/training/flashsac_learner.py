@@ -74,6 +74,8 @@ class FlashSACLearner:
             generator=self.generator,
         )
         self._debt = 0.0
+        self._planned = 1  # updates until rows are added
+        self._ahead: list[TensorDict] = []  # samples of those updates
         self.num_dropped = 0  # rows that were not finite
         self.last_update: dict[str, Any] | None = None
 
@@ -99,6 +101,7 @@ class FlashSACLearner:
         self._debt += self.config.updates_per_step
         whole = int(self._debt)
         self._debt -= whole
+        self._planned = whole
         return whole
 
     @torch.no_grad()
@@ -166,15 +169,15 @@ class FlashSACLearner:
         if bad < len(good):
             self.buffer.extend(packed[good] if bad else packed)
 
-    def sample(self) -> TensorDict:
-        """A replay sample, assembled: what the loss reads, batch (B,)."""
-        state, transition = self.codec.unpack(self.buffer.sample())
+    def sample(self, count: int = 1) -> list[TensorDict]:
+        """Assembled replay samples: what the loss reads, batch (B,) each."""
+        size = self.config.batch_size
+        state, transition = self.codec.unpack(self.buffer.sample(count * size))
         shown = assemble(self.sample_transforms, state)
-        size = transition.batch_size[0]
         wanted = [keys.OBSERVATION, keys.GROUP_MASK]
         if shown.get(keys.FUTURE, None) is not None:
             wanted.append(keys.FUTURE)
-        now, after = shown.select(*wanted).split(size)
+        now, after = shown.select(*wanted).split(count * size)
         after = after.set(keys.TERMINATED, transition[keys.TERMINATED])
         batch = now.set("next", after).set(keys.STEPS, transition[keys.STEPS])
         batch.set(keys.GROUP_MASK, self.groups.mask(batch[keys.GROUP_MASK]))
@@ -183,11 +186,18 @@ class FlashSACLearner:
         for i, group in enumerate(self.groups.names):
             batch.set((group, keys.ACTION), actions[i])
             batch.set(("next", group, keys.REWARD), reward[:, i : i + 1])
-        return batch
+        return list(batch.split(size))
 
     def update(self) -> TensorDict:
-        """One FlashSAC update on a fresh sample; returns its metrics."""
-        batch = self.sample()
+        """One FlashSAC update; returns its metrics.
+
+        The samples of all updates that are due are assembled at once, which costs
+        little more than one: the time goes into many small operations.
+        """
+        if not self._ahead:
+            self._ahead = self.sample(max(self._planned, 1))
+            self._planned = 1
+        batch = self._ahead.pop(0)
         self.last_update = {
             "batch": batch.to_dict(),
             "batch_size": len(batch),

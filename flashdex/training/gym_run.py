@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from flashdex.allocator import keep_freed_memory
 from flashdex.errors import RunError
 from flashdex.files import write_atomic
 from flashdex.recipe import GymRecipe, dump_recipe, expect_kind, load_recipe
@@ -90,6 +91,7 @@ def make_gym_learner(recipe: GymRecipe) -> GymLearner:
     Raises:
         FlashdexError: the environment cannot be used.
     """
+    keep_freed_memory()
     if recipe.train.torch_threads:
         torch.set_num_threads(recipe.train.torch_threads)
     worlds = GymWorlds(recipe.gym, num_envs=1, seed=recipe.seed)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from flashdex.allocator import keep_freed_memory
 from flashdex.errors import RunError
 from flashdex.files import write_atomic
 from flashdex.recipe import (
@@ -134,6 +135,7 @@ def _train(
     """Train from a checkpoint, or from the beginning when there is none."""
     recipe = bench.recipe
     torch.manual_seed(recipe.seed)
+    keep_freed_memory()
     if recipe.train.torch_threads:
         torch.set_num_threads(recipe.train.torch_threads)
     trainer = make_trainer(bench, run_dir, state, overrides)

@@ -164,7 +164,7 @@ def test_states_and_learners_share_no_memory(make_bench, collect):
     held = one.state_dict()
     kept = copy.deepcopy(held)
     two.load_state_dict(held)
-    batch = one.sample()
+    batch = one.sample()[0]
     for _ in range(2):
         two.agent.update(batch)
     assert same(held, kept)

@@ -49,7 +49,7 @@ def test_sample_is_what_the_policy_saw(make_bench, collect, bank):
     act = learner.act
     learner.act = lambda td: (seen.append(td.select(*keys.STATE).clone()), act(td))[1]
     collect(env, learner, 15)
-    batch = learner.sample()
+    batch = learner.sample()[0]
     assert batch.batch_size == (32,)
     shown = [assemble(learner.transforms, s) for s in seen]
     known = torch.cat([s[keys.OBSERVATION] for s in shown])
@@ -75,7 +75,7 @@ def test_unified_rewards_are_the_sum(make_bench, collect):
     learner.generator.manual_seed(0)
     row = learner.buffer.sample()
     learner.generator.manual_seed(0)
-    batch = learner.sample()
+    batch = learner.sample()[0]
     expected = row["reward"].sum(-1, keepdim=True)
     torch.testing.assert_close(batch["next", "both", keys.REWARD], expected)
     assert batch["both", keys.ACTION].shape == (32, 36)
@@ -125,7 +125,7 @@ def test_state_dict_continues_bit_for_bit(make_bench, collect, tmp_path, groups)
     td = collect(env, one, 20)
     for _ in range(3):
         one.update()
-    batch = one.sample()  # draws from the generator that goes along
+    batch = one.sample()[0]  # draws from the generator that goes along
     two = bench.make_learner(env)
     two.load_state_dict(through_a_file(one.state_dict(), tmp_path))
     a, b = one.agent.update(batch.clone()), two.agent.update(batch.clone())

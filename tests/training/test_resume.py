@@ -79,8 +79,8 @@ def test_without_rows_the_policy_fills_the_buffer_first(train_tiny):
     before = metrics(run_dir)[-1]
     resume(run_dir, ["total_env_steps=480"])
     after = metrics(run_dir)[-1]
-    # 40 rows come after 7 + 1 vector steps (n_step = 2), so 13 of 20 may learn
-    assert after["updates"] == before["updates"] + 13
+    # 40 rows are there after 7 + 1 vector steps (n_step = 2): the other 12 may learn
+    assert after["updates"] == before["updates"] + 12
     assert not (run_dir / "checkpoints/replay").exists()
 
 

@@ -1,0 +1,62 @@
+"""Print what a training run achieved, as the JSON kept in benchmarks/results.
+
+Usage: python benchmarks/summarise_run.py RUN --command "make quickstart" --note "..."
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from flashdex.bench.machine import describe_commit, describe_hardware
+from flashdex.training.jsonl import read_lines
+
+
+def summarise(run_dir: Path) -> dict[str, object]:
+    """Counters at the end and the first pass of every motion of ``run_dir``."""
+    last = read_lines(run_dir / "metrics.jsonl")[-1]
+    baselines = json.loads((run_dir / "baselines.json").read_text(encoding="utf-8"))
+    conversions: dict[str, object] = {}
+    for line in read_lines(run_dir / "conversions.jsonl"):
+        if line["converted"] and line["motion"] not in conversions:
+            kept = ("env_steps", "wall_s", "errors", "certified", "verdict", "trivial")
+            conversions[line["motion"]] = {key: line.get(key) for key in kept}
+    return {
+        "env_steps": last["env_steps"],
+        "minutes": round(60 * last["hours"], 2),
+        "updates": last["updates"],
+        "converted": len(conversions),
+        "motions": len(baselines["frozen_object"]),
+        "certified": last["convert/certified"],
+        "robust": last["convert/robust"],
+        "last_attempts_passing": last["convert/last"],
+        "conversions": conversions,
+        "baselines": {
+            name: {
+                m: row["errors"] | {"state": row["state"]} for m, row in rows.items()
+            }
+            for name, rows in baselines.items()
+        },
+    }
+
+
+def main() -> None:
+    """Read the command line and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--command", required=True, help="that started the run")
+    parser.add_argument("--note", required=True, help="state of the machine")
+    args = parser.parse_args()
+    head = {
+        "benchmark": args.run.name,
+        "command": args.command,
+        "note": args.note,
+        "hardware": describe_hardware(),
+        "commit": describe_commit(),
+    }
+    print(json.dumps(head | summarise(args.run), indent=1))
+
+
+if __name__ == "__main__":
+    main()

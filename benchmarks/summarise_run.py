@@ -53,7 +53,7 @@ def main() -> None:
         "command": args.command,
         "note": args.note,
         "hardware": describe_hardware(),
-        "commit": describe_commit(),
+        "summarised_at_commit": describe_commit(),
     }
     print(json.dumps(head | summarise(args.run), indent=1))
 

@@ -112,7 +112,7 @@ class AlgoConfig:
     bfloat16: bool = False
     """Large matrix products of the updates in bfloat16, everything else in float32."""
     compile: bool = False
-    """Compile the updates (GPU); slow first minute, then faster."""
+    """Compile the updates: some slow minutes, then faster."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """Numbers of the PPO baseline."""
 
@@ -142,8 +142,8 @@ class TrainConfig(LoopConfig):
     """The loop around the updates: checkpoints, logs, criterion, end."""
 
     overlap: bool = True
-    """Learn in a second thread while the physics steps; same results, faster where
-    there are two cores or a GPU."""
+    """Learn in a second thread while the physics steps: same results, faster with two
+    cores."""
     stop_when_all_converted: bool = True
     """Stop once every motion is converted."""
     criterion: Criterion = "sr_mt_obj"

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+import torch
+
 
 class Alongside:
     """Runs one piece of work while the body of a ``with`` block runs.
@@ -25,7 +27,12 @@ class Alongside:
     """
 
     def __init__(self, *, threaded: bool) -> None:
-        self._pool = ThreadPoolExecutor(1, "learner") if threaded else None
+        self._pool: ThreadPoolExecutor | None = None
+        if threaded:
+            self._pool = ThreadPoolExecutor(1, "learner")
+            # A thread takes the number that is set when it first asks, and the block
+            # may have lowered it for itself just then: ask now.
+            self._pool.submit(torch.get_num_threads).result()
 
     @contextmanager
     def run(self, work: Callable[[], None] | None) -> Iterator[None]:

@@ -70,7 +70,6 @@ class FlashSACLearner:
         self.codec = RowCodec(bank)
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(config.buffer_size),
-            batch_size=config.batch_size,
             generator=self.generator,
         )
         self._debt = 0.0

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 import torch
 
+from flashdex.envs.threads import few_threads
 from flashdex.training.alongside import Alongside
 from flashdex.training.checkpoint import load_checkpoint
 
@@ -27,6 +29,29 @@ def test_both_run_at_the_same_time():
     with Alongside(threaded=True).run(meet.wait):
         meet.wait()
     assert not meet.broken
+
+
+def test_the_work_keeps_its_torch_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    found = []
+
+    def work():
+        lowered.wait(20)
+        torch.rand(512, 512) @ torch.rand(512, 512)
+        found.append(torch.get_num_threads())
+
+    lowered = threading.Event()
+    try:
+        alongside = Alongside(threaded=True)
+        with alongside.run(work), few_threads(1):
+            lowered.set()
+            while not found:
+                time.sleep(0.001)
+            assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+    assert found == [3]
 
 
 @pytest.mark.parametrize("threaded", [True, False])

@@ -73,7 +73,7 @@ def test_unified_rewards_are_the_sum(make_bench, collect):
     learner = bench.make_learner(env)
     collect(env, learner, 12)
     learner.generator.manual_seed(0)
-    row = learner.buffer.sample()
+    row = learner.buffer.sample(32)
     learner.generator.manual_seed(0)
     batch = learner.sample()[0]
     expected = row["reward"].sum(-1, keepdim=True)

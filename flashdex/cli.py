@@ -116,8 +116,9 @@ def _add_run_verbs(
     verb = add("train", _train, "train a recipe: train RECIPE key=value ...")
     verb.add_argument("recipe", nargs="?", help="name or path")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
-    verb.add_argument("--resume", type=Path, metavar="RUN", help="continue a run")
-    verb.add_argument(
+    one = verb.add_mutually_exclusive_group()
+    one.add_argument("--resume", type=Path, metavar="RUN", help="continue a run")
+    one.add_argument(
         "-m", "--multirun", action="store_true", help="one run for each of key=a,b"
     )
     verb.add_argument(
@@ -198,12 +199,14 @@ def _prepare(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace) -> int:
     from flashdex.recipe import compose, compose_runs, dump_recipe
+    from flashdex.training.any_run import resume, stored_recipe, train
 
     if args.resume is not None:
-        from flashdex.training.any_run import resume
-
-        first = [args.recipe] if args.recipe else []
-        _show_run(resume(args.resume, first + args.overrides))
+        words = [args.recipe, *args.overrides] if args.recipe else args.overrides
+        if args.cfg:
+            print(dump_recipe(stored_recipe(args.resume, words)), end="")
+        else:
+            _show_run(resume(args.resume, words))
         return 0
     if args.recipe is None:
         raise FlashdexError("give a recipe (see `flashdex ls`) or --resume RUN")
@@ -214,8 +217,6 @@ def _train(args: argparse.Namespace) -> int:
     if args.cfg:
         print("---\n".join(dump_recipe(recipe) for recipe in recipes), end="")
         return 0
-    from flashdex.training.any_run import train
-
     for recipe in recipes:
         if not _show_run(train(recipe)):
             break

@@ -58,6 +58,11 @@ def test_debug_shows_the_traceback():
         (["train", "quickstart", "--lr", "3"], "key=value, without dashes"),
         (["ls", "something"], "unknown: something"),
         (["train", "quickstart", "env.num_env=3"], "Did you mean 'num_envs'?"),
+        (["train", "quickstart", "algo.init_std=1.0"], "must be at most 0.99"),
+        (["train", "quickstart", "algo.init_std=0.0067"], "must be at least 0.007"),
+        (["train", "--resume", "/nowhere"], "not a run directory"),
+        (["train", "--resume", "/nowhere", "--cfg", "job"], "not a run directory"),
+        (["train", "--resume", "/nowhere", "-m", "seed=0,1"], "not allowed with"),
         (["validate", "/nowhere/x.yaml"], "no such file"),
         (["score", "/nowhere/x.npz"], "no such file"),
         (["score"], "required"),
@@ -84,6 +89,19 @@ def test_overrides_may_stand_behind_flags(run):
     code, out, _ = run("train", "quickstart", "--cfg", "job", "seed=7", "hand=xhand")
     assert code == 0
     assert yaml.safe_load(out)["seed"] == 7
+
+
+def test_cfg_at_a_resume_prints_the_stored_recipe_and_starts_nothing(run, tmp_path):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(run("train", "quickstart", "seed=5", "--cfg", "job")[1])
+    argv = ("train", "--resume", str(tmp_path), "algo.lr=2e-3", "--cfg", "job")
+    code, out, _ = run(*argv)
+    assert code == 0
+    expected = yaml.safe_load(path.read_text())
+    assert expected["algo"]["lr"] != 2e-3
+    expected["algo"]["lr"] = 2e-3
+    assert yaml.safe_load(out) == expected
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_cp_then_validate(run, tmp_path):

@@ -66,7 +66,9 @@ class NoiseRepetition(nn.Module):
         Returns:
             (G, N, A), standard normal.
         """
-        if tuple(self.noise.shape) != tuple(shape):
+        fits = tuple(self.noise.shape) == tuple(shape)
+        # a loaded state may come from the other clock
+        if not fits or tuple(self.count.shape) != self._clocks(shape):
             self._allocate(shape)
         device = self.cdf.device
         fresh = torch.randn(shape, generator=self.generator, device=device)
@@ -85,8 +87,11 @@ class NoiseRepetition(nn.Module):
         self.count.copy_(torch.where(redraw, 1, self.count + 1))
         return self.noise.clone()
 
+    def _clocks(self, shape: tuple[int, int, int]) -> tuple[int, int]:
+        return (1, 1) if self.clock == "shared" else (shape[0], shape[1])
+
     def _allocate(self, shape: tuple[int, int, int]) -> None:
-        clocks = (1, 1) if self.clock == "shared" else shape[:2]
+        clocks = self._clocks(shape)
         device = self.cdf.device
         self.noise = torch.zeros(shape, device=device)
         self.count = torch.zeros(clocks, dtype=torch.int64, device=device)

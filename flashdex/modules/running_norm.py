@@ -40,8 +40,13 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Merge the moments of ``x``, (B, D) or (B, D, K), into the running ones."""
+        """Merge the moments of ``x``, (B, D) or (B, D, K), into the running ones.
+
+        No rows change nothing: their moments would be NaN.
+        """
         rows = x.movedim(1, -1).flatten(0, -2).double()
+        if not len(rows):
+            return
         var, mean = torch.var_mean(rows, 0, correction=0)
         number = len(rows)
         total = self.count + number

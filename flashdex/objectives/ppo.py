@@ -105,7 +105,7 @@ class PPO:
         minibatches: int = 4,
         generator: torch.Generator | None = None,
     ) -> None:
-        self.policy, self.value = policy, value
+        self.policy, self.value, self.lr = policy, value, lr
         self.target_kl, self.max_grad_norm = target_kl, max_grad_norm
         self.epochs, self.minibatches = epochs, minibatches
         self.generator = generator
@@ -227,10 +227,18 @@ class PPO:
             "policy": self.policy.state_dict(),
             "value": self.value.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "lr": self.lr,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``."""
+        """Restore ``state_dict``.
+
+        The steered rate goes on, unless this learner was given another first rate than
+        the one of the state: then it starts again from there.
+        """
         self.policy.load_state_dict(state["policy"])
         self.value.load_state_dict(state["value"])
         self.optimizer.load_state_dict(state["optimizer"])
+        if state["lr"] != self.lr:
+            group = self.optimizer.param_groups[0]
+            group["lr"] = torch.full_like(self.rate, self.lr)

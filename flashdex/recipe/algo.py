@@ -89,8 +89,9 @@ class AlgoConfig:
     """Temperature at the start, each group."""
     target_std: float = number(0.15, above=0)
     """Standard deviation that sets the target entropy, each action dimension."""
-    init_std: float = number(0.082, above=0, high=1)
-    """Standard deviation of the policy at the start (centred head)."""
+    init_std: float = number(0.082, low=0.007, high=0.99)
+    """Standard deviation of the policy at the start (centred head, which keeps it
+    between exp(-5) = 0.0067 and 1)."""
     head: Literal["centred", "unit"] = "centred"
     """centred starts at mean 0, on the reference; unit is FlashSAC's own."""
     norm_warmup: bool = False

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flashdex.recipe import GymRecipe, Recipe, RunRecipe, expect_kind, task_of_run
+from flashdex.errors import RunError
+from flashdex.recipe import (
+    GymRecipe,
+    Recipe,
+    RunRecipe,
+    expect_kind,
+    load_recipe,
+    task_of_run,
+)
 
 
 def train(recipe: RunRecipe) -> Path:
@@ -20,6 +28,22 @@ def train(recipe: RunRecipe) -> Path:
     from flashdex.training.run import train as train_retarget
 
     return train_retarget(expect_kind(recipe, Recipe, where="train"))
+
+
+def stored_recipe(run_dir: Path, overrides: list[str]) -> RunRecipe:
+    """Read the recipe that `resume` would go on with; nothing is started.
+
+    Args:
+        run_dir: run directory.
+        overrides: ``key=value`` changes to the stored recipe.
+
+    Raises:
+        RunError: the folder holds no run.
+    """
+    path = run_dir / "recipe.yaml"
+    if not path.is_file():
+        raise RunError(f"{run_dir}: not a run directory, there is no {path.name} in it")
+    return load_recipe(path, overrides)
 
 
 def resume(run_dir: Path, overrides: list[str]) -> Path:

@@ -49,7 +49,7 @@ def make_trainer(
     env = bench.make_env()
     learner = bench.make_learner(env)
     if state is not None:
-        _restore(learner, state)
+        restore(learner, state)
     if overrides:
         write_atomic(run_dir / RECIPE, dump_recipe(recipe))
         (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
@@ -119,17 +119,26 @@ def _provenance(bench: Workbench) -> dict[str, str]:
     }
 
 
-def _restore(learner: Learner, state: dict[str, Any]) -> None:
+def restore(learner: Learner, state: dict[str, Any]) -> None:
+    """Put a checkpoint into a learner; its worlds begin new episodes.
+
+    Args:
+        learner: as the recipe makes it.
+        state: checkpoint.
+
+    Raises:
+        RunError: it is of other networks, observations or worlds.
+    """
     try:
         learner.load_state_dict(state["learner"])
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, KeyError, ValueError) as error:
         lines = [line.strip() for line in str(error).splitlines()]
         fault = " ".join(lines[:2])
         raise RunError(
             "the checkpoint does not fit the recipe: an override changed the networks, "
             "the observation or env.num_envs, or another version of flashdex wrote it "
-            f"({fault}{' ...' if len(lines) > 2 else ''}). Resume without the override "
-            "or with that version, or start a new run."
+            f"({fault}{' ...' if len(lines) > 2 else ''}). Leave the override out, use "
+            "that version, or start a new run."
         ) from error
     learner.forget_episodes()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,19 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 FOLDER = "checkpoints"
-FORMAT = 1  # raised whenever older code could misread a checkpoint
+FORMAT = 2  # raised whenever older code could misread a checkpoint
+EVALUATED = ("env_steps", "learner", "recipe")
+RESUMED = (
+    *EVALUATED,
+    "vector_steps",
+    "wall_s",
+    "assist",
+    "assist_epoch",
+    "env_generator",
+    "torch_rng",
+    "ledger_bytes",
+    "wandb_id",
+)
 
 
 def save_checkpoint(
@@ -60,14 +73,21 @@ def save_checkpoint(
     return path
 
 
-def load_checkpoint(run_dir: Path) -> dict[str, Any]:
+def load_checkpoint(
+    run_dir: Path, needs: Collection[str] = ("env_steps",)
+) -> dict[str, Any]:
     """Read the newest checkpoint of a run that can be read.
 
     One that cannot (a full or failing disk) is named in a warning, and the one before
     is taken.
 
+    Args:
+        run_dir: run directory.
+        needs: keys the caller reads, `EVALUATED` or `RESUMED` say.
+
     Raises:
-        RunError: there is none, none can be read, or another version wrote it.
+        RunError: there is none, none can be read, another version wrote it, or a key
+            is missing.
     """
     found = _newest_first(run_dir)
     if not found:
@@ -83,7 +103,7 @@ def load_checkpoint(run_dir: Path) -> dict[str, Any]:
             faults.append(f"{path.name}: {_first_line(error)}")
             _LOG.warning("%s cannot be read, trying the one before", path)
             continue
-        check_format(state, path)
+        check_format(state, path, needs)
         return state
     raise RunError(
         f"{run_dir / FOLDER}: no checkpoint can be read ({'; '.join(faults)}). Restore "
@@ -91,18 +111,27 @@ def load_checkpoint(run_dir: Path) -> dict[str, Any]:
     )
 
 
-def check_format(state: Any, path: Path) -> None:
-    """Refuse a checkpoint of another version.
+def check_format(state: Any, path: Path, needs: Collection[str] = ()) -> None:
+    """Refuse a checkpoint of another version, or one without what is needed.
 
     Args:
         state: what the file holds.
         path: the file, for the message.
+        needs: keys that must be there.
+
+    Raises:
+        RunError: the format is another one, or a key is missing.
     """
     found = state.get("format", 0) if isinstance(state, dict) else None
     if found != FORMAT:
         raise RunError(
             f"{path}: checkpoint format {found}, this version reads {FORMAT}. Go on "
             "with the flashdex that wrote it (versions.json in the run), or start anew."
+        )
+    if missing := [key for key in needs if key not in state]:
+        raise RunError(
+            f"{path}: not a whole checkpoint, it lacks {', '.join(missing)}. Move it "
+            "away to go on from the one before, or start a new run."
         )
 
 

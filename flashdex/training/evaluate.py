@@ -14,7 +14,9 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.files import write_atomic
 from flashdex.metrics.aggregate import mean_object_errors, mope_more
 from flashdex.metrics.criteria import score
-from flashdex.training.checkpoint import load_checkpoint
+from flashdex.training.assemble import restore
+from flashdex.training.checkpoint import EVALUATED, load_checkpoint
+from flashdex.training.fixed import stored_value
 from flashdex.training.rollouts import roll_all
 from flashdex.training.run import load_run_recipe
 from flashdex.training.setup import open_workbench
@@ -47,10 +49,12 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> Evaluation:
     """
     run_dir = Path(run)
     recipe = load_run_recipe(run_dir, overrides)
-    state = load_checkpoint(run_dir)
+    state = load_checkpoint(run_dir, EVALUATED)
     bench = open_workbench(recipe)
-    learner = bench.make_learner(bench.make_env())
-    learner.load_state_dict(state["learner"])
+    # The learner keeps a running return a world: as many as it was trained with.
+    num_envs = stored_value(state["recipe"], "env.num_envs")
+    learner = bench.make_learner(bench.make_env(num_envs=num_envs))
+    restore(learner, state)
 
     def act(td: TensorDictBase, env: TrackingEnv) -> Tensor:
         return learner.act(td, explore=False)

@@ -25,7 +25,8 @@ class GymStep:
         observation: after the step, the last one of an episode included, (N, D).
         reward: (N, 1).
         terminated: the environment ended the episode, (N, 1) bool.
-        truncated: the step limit did, and nothing else, (N, 1) bool.
+        truncated: the step limit did, and nothing else, (N, 1) bool; set also where
+            the observation is not finite, from which nothing could go on.
     """
 
     observation: Tensor
@@ -51,8 +52,8 @@ class GymWorlds:
         seed: of their starts; world i takes ``seed + i``.
 
     Raises:
-        FlashdexError: the environment does not exist, cannot be made, or has other
-            than flat observations and bounded continuous actions.
+        FlashdexError: the environment does not exist, cannot be made, has other than
+            flat observations and bounded continuous actions, or no step limit.
         MissingExtraError: gymnasium is not installed.
     """
 
@@ -60,6 +61,7 @@ class GymWorlds:
         self.num_envs, self.seed = num_envs, seed
         self._env = _make_vector_env(config, num_envs)
         self._check_spaces(config)
+        self._check_limit(config)
         self.observation_dim: int = self._env.single_observation_space.shape[0]
         self.action_dim: int = self._env.single_action_space.shape[0]
 
@@ -77,6 +79,15 @@ class GymWorlds:
                 "(a flat Box) are supported."
             )
 
+    def _check_limit(self, config: GymConfig) -> None:
+        own = self._env.spec.max_episode_steps
+        if config.max_episode_steps is None and own is None:
+            raise FlashdexError(
+                f"gym.max_episode_steps: {config.env_id} has no step limit of its own, "
+                "so that an episode, and with it an evaluation, might never end. Set "
+                "gym.max_episode_steps=1000, say."
+            )
+
     def reset(self) -> Tensor:
         """Start every world from its seed; observations, (N, D)."""
         observation, _ = self._env.reset(seed=self.seed)
@@ -90,13 +101,14 @@ class GymWorlds:
             action: (N, A) in [-1, 1].
         """
         observation, reward, terminated, truncated, _ = self._env.step(action.numpy())
-        ended = _column(terminated)
+        ended, seen = _column(terminated), _tensor(observation)
+        lost = ~seen.isfinite().all(-1, keepdim=True)
         return GymStep(
-            observation=_tensor(observation),
+            observation=seen,
             reward=_tensor(reward).unsqueeze(-1),
             terminated=ended,
             # An environment may fail in the very step that reaches the limit.
-            truncated=_column(truncated) & ~ended,
+            truncated=(_column(truncated) | lost) & ~ended,
         )
 
     def reset_done(self, done: Tensor) -> Tensor:

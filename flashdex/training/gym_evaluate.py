@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,8 +15,14 @@ from flashdex.recipe import GymRecipe
 from flashdex.training.gym import GymWorlds
 from flashdex.training.learner import Learner
 
-# Keeps the starts of evaluations apart from those of training.
-SEED_OFFSET = 1_000_000
+_LOG = logging.getLogger(__name__)
+# Keeps the starts of evaluations apart from those of training. A resumed run begins at
+# its seed plus its env steps, so the offset is one that no budget reaches.
+SEED_OFFSET = 2**30
+
+
+class StoppedError(Exception):
+    """An evaluation was told to end before its episodes did."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +30,7 @@ class GymEvaluation:
     """One episode of each world.
 
     Attributes:
-        returns: undiscounted sums of raw rewards, (E,).
+        returns: undiscounted sums of raw rewards, (E,); those not finite count as 0.
         lengths: steps, (E,).
     """
 
@@ -46,41 +54,65 @@ def observed(observation: Tensor) -> TensorDict:
     return TensorDict({keys.OBSERVATION: observation}, [len(observation)])
 
 
-def evaluate_recipe(recipe: GymRecipe, learner: Learner) -> GymEvaluation:
+def evaluate_recipe(
+    recipe: GymRecipe,
+    learner: Learner,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> GymEvaluation:
     """Play the evaluation episodes of a recipe: the same starts at every call.
 
     Args:
         recipe: names the environment and the number of episodes.
         learner: acts; neither its noise nor its statistics move.
+        should_stop: asked before every vector step.
+
+    Raises:
+        StoppedError: ``should_stop`` said so.
     """
     config = recipe.gym
     worlds = GymWorlds(
         config, num_envs=config.eval_episodes, seed=recipe.seed + SEED_OFFSET
     )
     try:
-        return evaluate_policy(learner, worlds)
+        return evaluate_policy(learner, worlds, should_stop=should_stop)
     finally:
         worlds.close()
 
 
-def evaluate_policy(learner: Learner, worlds: GymWorlds) -> GymEvaluation:
+def evaluate_policy(
+    learner: Learner,
+    worlds: GymWorlds,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> GymEvaluation:
     """Play one episode in each world from its seed, without exploration.
 
     Args:
         learner: acts; neither its noise nor its statistics move.
         worlds: one an episode, of a limited length.
+        should_stop: asked before every vector step.
+
+    Raises:
+        StoppedError: ``should_stop`` said so.
     """
     returns = torch.zeros(worlds.num_envs, 1, dtype=torch.float64)
     lengths = torch.zeros(worlds.num_envs, 1, dtype=torch.int64)
     alive = torch.ones(worlds.num_envs, 1, dtype=torch.bool)
+    bad = 0
     observation = worlds.reset()
-    while True:
+    while alive.any():
+        if should_stop():
+            raise StoppedError
         step = worlds.step(learner.act(observed(observation), explore=False))
-        returns += step.reward * alive
+        finite = step.reward.isfinite()
+        bad += int((alive & ~finite).sum())
+        returns += torch.where(alive & finite, step.reward, 0.0)
         lengths += alive
         alive &= ~step.done
-        if not alive.any():
-            return GymEvaluation(returns.squeeze(-1), lengths.squeeze(-1))
         observation = step.observation
         if step.done.any():  # worlds step together; a second episode does not count
             observation = worlds.reset_done(step.done)
+    if bad:
+        _LOG.warning("%d rewards of the evaluation were not finite: taken as 0", bad)
+    return GymEvaluation(returns.squeeze(-1), lengths.squeeze(-1))

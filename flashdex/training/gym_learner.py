@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flashdex import keys
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
+from flashdex.training.guard import finite_rows
 from flashdex.training.nstep import NStepAssembler
 
 NEXT_OBSERVATION = "next_observation"
@@ -63,6 +64,7 @@ class GymLearner:
             generator=self.generator,
         )
         self._debt = 0.0
+        self.num_dropped = 0  # rows that were not finite
 
     @property
     def ready(self) -> bool:
@@ -114,20 +116,35 @@ class GymLearner:
         terminated: Tensor,
         done: Tensor,
     ) -> None:
-        """Update the reward statistics and store what the n-step window yields."""
-        self.agent.normalizer.update(reward, done)
+        """Update the reward statistics and store what the n-step window yields.
+
+        Rows that are not finite are dropped and counted.
+        """
+        finite = reward.isfinite()
+        clean = torch.where(finite, reward, 0.0)
+        self.agent.normalizer.update(clean, done, finite)
         row = self.nstep.push(state, action, reward, next_state, terminated, done)
-        if row is None:
+        if row is not None:
+            self._store(row)
+
+    def _store(self, row: TensorDict) -> None:
+        good = finite_rows(row)
+        bad = len(good) - int(good.sum())
+        self.num_dropped += bad
+        if bad == len(good):
             return
+        after = row["next_state", keys.OBSERVATION]
         flat = {
             keys.OBSERVATION: row["state", keys.OBSERVATION],
-            NEXT_OBSERVATION: row["next_state", keys.OBSERVATION],
+            # after a true termination it counts for nothing, but BatchNorm reads it
+            NEXT_OBSERVATION: torch.where(after.isfinite(), after, 0.0),
             keys.ACTION: row["action"],
             keys.REWARD: row["reward"],
             keys.TERMINATED: row["terminated"],
             keys.STEPS: row["steps"].to(torch.int16),
         }
-        self.buffer.extend(TensorDict(flat, batch_size=row.batch_size))
+        rows = TensorDict(flat, batch_size=row.batch_size)
+        self.buffer.extend(rows[good] if bad else rows)
 
     def sample(self) -> TensorDict:
         """A replay sample as the loss reads it, batch (B,)."""
@@ -161,6 +178,7 @@ class GymLearner:
             "agent": self.agent.state_dict(),
             "nstep": self.nstep.state_dict(),
             "debt": self._debt,
+            "dropped": self.num_dropped,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -168,3 +186,4 @@ class GymLearner:
         self.agent.load_state_dict(state["agent"])
         self.nstep.load_state_dict(state["nstep"])
         self._debt = state["debt"]
+        self.num_dropped = state.get("dropped", 0)  # older checkpoints have no such key

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,20 @@ from torch import Tensor
 
 from flashdex.errors import RunError
 from flashdex.recipe import GymRecipe
-from flashdex.training.checkpoint import save_checkpoint
-from flashdex.training.guard import GradientGuard, NonFiniteError
+from flashdex.training.checkpoint import newest_checkpoint, save_checkpoint
+from flashdex.training.guard import (
+    GradientGuard,
+    NonFiniteError,
+    first_non_finite,
+    numeric_errors,
+)
 from flashdex.training.gym import GymWorlds
-from flashdex.training.gym_evaluate import evaluate_recipe, observed
+from flashdex.training.gym_evaluate import StoppedError, evaluate_recipe, observed
 from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_stats import GymStats
 from flashdex.training.logging import MetricLog
 from flashdex.training.replay_file import ReplayLog
-from flashdex.training.sessions import Start
+from flashdex.training.sessions import SIGNAL, Start
 from flashdex.training.signals import StopSignals
 
 _LOG = logging.getLogger(__name__)
@@ -51,7 +57,8 @@ class GymTrainer:
         self.learner, self.log, self.replay = learner, log, replay
         self.start, self.env_steps = start, start.env_steps
         self.stats = GymStats(recipe.gym.num_envs)
-        self._began = time.monotonic()
+        self._saved_at = self._logged_at = start.env_steps
+        self._began = self._last_log = time.monotonic()
         self._stop = StopSignals()
 
     @property
@@ -63,7 +70,7 @@ class GymTrainer:
         """Train until the budget, a limit or a signal ends it; return why.
 
         Raises:
-            RunError: a gradient was not finite, or the folder cannot be written.
+            RunError: something was not finite, or the folder cannot be written.
         """
         recipe, config = self.recipe, self.recipe.gym
         # A resumed run goes on from fresh starts, not from those it began with.
@@ -73,12 +80,10 @@ class GymTrainer:
         try:
             with self._stop, GradientGuard():
                 why = self._loop(worlds)
+                self._write_log()
                 self.save()
         except NonFiniteError as error:
-            raise RunError(
-                f"{self.run_dir}: stopped at {self.env_steps} env steps, not finite: "
-                f"{error}. The checkpoints are from before."
-            ) from error
+            raise self._not_finite(str(error)) from error
         except OSError as error:
             raise RunError(
                 f"{self.run_dir}: cannot be written ({error}). Make room, then "
@@ -89,20 +94,16 @@ class GymTrainer:
         return why
 
     def _loop(self, worlds: GymWorlds) -> str:
-        recipe = self.recipe
+        train = self.recipe.train
         observation = worlds.reset()
-        last_log = last_save = time.monotonic()
-        why = ""
-        while not why:
+        self._last_log = last_save = time.monotonic()
+        while not (why := self._end_reason()):
             observation = self.vector_step(worlds, observation)
-            why = self._end_reason()
-            due = self._evaluation_due() or why == "budget"
-            now = time.monotonic()
-            if due or why or now - last_log >= recipe.train.log_every_s:
-                self._write_log(now - last_log, evaluate=due)
-                last_log = time.monotonic()
-            if now - last_save >= recipe.train.checkpoint_every_s:
-                self.save()
+            due = self._evaluation_due()
+            if due or time.monotonic() - self._last_log >= train.log_every_s:
+                self._write_log(evaluate=due)
+            if time.monotonic() - last_save >= train.checkpoint_every_s:
+                self._try_to_save()
                 last_save = time.monotonic()
         return why
 
@@ -129,7 +130,7 @@ class GymTrainer:
             )
         self.stats.add_rewards(step.reward, step.terminated, step.done)
         for _ in range(self.learner.due()):
-            with self.stats.time("update"):
+            with self.stats.time("update"), numeric_errors(self.learner):
                 self.stats.add_update(self.learner.update())
         return worlds.reset_done(step.done) if step.done.any() else step.observation
 
@@ -137,46 +138,87 @@ class GymTrainer:
         config = self.recipe.gym
         before = self.env_steps - config.num_envs
         every = config.eval_every_env_steps
-        return self.env_steps // every > before // every
+        is_last = self.env_steps >= self.recipe.total_env_steps
+        return is_last or self.env_steps // every > before // every
 
     def _end_reason(self) -> str:
         limit = self.recipe.train.wall_limit_s
+        if self.env_steps >= self.recipe.total_env_steps:
+            return "budget"
         if self._stop.requested:
-            return "signal"
-        if limit is not None and self.wall_s > limit:
-            return "wall_limit_s"
-        return "budget" if self.env_steps >= self.recipe.total_env_steps else ""
+            return SIGNAL
+        return "wall_limit_s" if limit is not None and self.wall_s > limit else ""
 
-    def _write_log(self, seconds: float, *, evaluate: bool) -> None:
+    def _write_log(self, *, evaluate: bool = False) -> None:
+        if self.env_steps == self._logged_at:
+            return  # it was logged by time, or a resume has nothing left to do
+        seconds = max(time.monotonic() - self._last_log, 1e-9)
         record: dict[str, Any] = {
             "env_steps": self.env_steps,
             "hours": self.wall_s / 3600,
             "updates": self.learner.updates,
-            **self.stats.pop(max(seconds, 1e-9), self.recipe.gym.num_envs),
+            **self.stats.pop(seconds, self.recipe.gym.num_envs),
             "buffer/rows": self.learner.num_rows,
+            "buffer/dropped": self.learner.num_dropped,
             "reward/scale": self.learner.agent.normalizer.denominator().item(),
         }
         if evaluate:
-            with self.stats.time("evaluate"):
-                found = evaluate_recipe(self.recipe, self.learner).metrics()
-            record |= found
-            _LOG.info(
-                "%d of %d env steps, return %.1f +- %.1f over %d episodes, %.0f s",
-                self.env_steps,
-                self.recipe.total_env_steps,
-                found["eval/return"],
-                found["eval/return_std"],
-                found["eval/episodes"],
-                self.wall_s,
-            )
+            with suppress(StoppedError):  # the record goes without it
+                record |= self._evaluate()
+        if bad := first_non_finite(record):
+            raise NonFiniteError(bad)
         self.log.write(record)
+        self._last_log, self._logged_at = time.monotonic(), self.env_steps
 
-    def save(self) -> Path:
-        """Write a checkpoint, and beside it the new rows of the replay buffer."""
-        keep = self.recipe.train.keep_checkpoints
-        return save_checkpoint(
-            self.run_dir, self.state_dict(), keep=keep, replay=self.replay
+    def _evaluate(self) -> dict[str, float]:
+        with self.stats.time("evaluate"):
+            found = evaluate_recipe(
+                self.recipe, self.learner, should_stop=lambda: self._stop.requested
+            ).metrics()
+        _LOG.info(
+            "%d of %d env steps, return %.1f +- %.1f over %d episodes, %.0f s",
+            self.env_steps,
+            self.recipe.total_env_steps,
+            found["eval/return"],
+            found["eval/return_std"],
+            found["eval/episodes"],
+            self.wall_s,
         )
+        return found
+
+    def _not_finite(self, what: str) -> RunError:
+        algo, steps = self.recipe.algo, self.env_steps
+        return RunError(
+            f"{self.run_dir}: not finite after {steps} env steps and "
+            f"{self.learner.updates} updates: {what}. No checkpoint was written over; "
+            f"the newest good one is {newest_checkpoint(self.run_dir)}. Go on from it "
+            f"with a smaller learning rate, say: flashdex train --resume "
+            f"{self.run_dir} algo.lr={algo.lr / 2:g} "
+            f"algo.lr_final={algo.lr_final / 2:g}"
+        )
+
+    def _try_to_save(self) -> None:
+        """Save; a disk that is full may have room again at the next time."""
+        try:
+            self.save()
+        except OSError as error:
+            _LOG.warning("no checkpoint this time, the run goes on: %s", error)
+
+    def save(self) -> None:
+        """Write a checkpoint and the new replay rows, unless there is one of this step.
+
+        Raises:
+            NonFiniteError: what would be stored is not finite.
+            OSError: it cannot be written.
+        """
+        if self.env_steps == self._saved_at:
+            return
+        state = self.state_dict()
+        if bad := first_non_finite(state["learner"]):
+            raise NonFiniteError(bad)
+        keep = self.recipe.train.keep_checkpoints
+        save_checkpoint(self.run_dir, state, keep=keep, replay=self.replay)
+        self._saved_at = self.env_steps
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs but the rows, tensors and plain values."""

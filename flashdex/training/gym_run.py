@@ -157,9 +157,14 @@ def _restore(learner: GymLearner, state: dict[str, Any]) -> None:
     try:
         learner.load_state_dict(state["learner"])
     except (RuntimeError, KeyError) as error:
+        # torch names every tensor that differs; the first one tells enough
+        lines = [line.strip() for line in str(error).splitlines()]
+        fault = " ".join(lines[:2])
         raise RunError(
             "the checkpoint does not fit the recipe: an override changed the networks, "
-            f"the environment or gym.num_envs, or another version wrote it ({error})."
+            "the environment or gym.num_envs, or another version of flashdex wrote it "
+            f"({fault}{' ...' if len(lines) > 2 else ''}). Go on without the override "
+            "or with that version, or start a new run."
         ) from error
     learner.forget_episodes()
 

@@ -24,12 +24,12 @@ class GymStats(RunningStats):
         """Take in one vector step.
 
         Args:
-            reward: raw, (N, 1).
+            reward: raw, (N, 1); those not finite count as 0.
             terminated: (N, 1) bool.
             done: terminated or truncated, (N, 1) bool.
         """
         self._steps += 1
-        self._returns += reward
+        self._returns += torch.where(reward.isfinite(), reward, 0.0)
         self._lengths += 1
         ended, failed = int(done.sum()), int(terminated.sum())
         if not ended:

@@ -32,7 +32,8 @@ class PPOLearner:
     of the policy. Nor are steps of a motion that a hand takes no part in.
 
     Rewards are scaled as FlashSAC's are, by the running spread of the discounted
-    return, so that both learners see the same numbers.
+    return, but over other worlds: here attempt worlds are left out of the statistics,
+    there they count, so that the two learners see about the same numbers, not the same.
 
     Args:
         config: algorithm part of the recipe.

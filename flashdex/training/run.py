@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from flashdex.recipe import (
 from flashdex.training.assemble import RECIPE, make_trainer
 from flashdex.training.attempts import versions
 from flashdex.training.checkpoint import (
+    RESUMED,
     has_checkpoint,
     load_checkpoint,
     remove_temporaries,
     set_aside_newer,
 )
+from flashdex.training.fixed import refuse_changes
 from flashdex.training.lock import run_lock
 from flashdex.training.sessions import end_session
 from flashdex.training.setup import Workbench, open_workbench
@@ -54,14 +57,9 @@ def train(recipe: Recipe) -> Path:
         RunError: the folder already holds a run.
     """
     run_dir = default_run_dir(recipe)
-    if (run_dir / RECIPE).exists():
-        raise RunError(
-            f"{run_dir}: already holds a run. Continue it with 'flashdex train "
-            f"--resume {run_dir}', or choose another folder with run_dir=..."
-        )
+    refuse_old_run(run_dir)  # at once, before motions are prepared
     bench = open_workbench(recipe)
-    create_run_dir(run_dir, recipe)
-    with run_lock(run_dir):
+    with new_run(run_dir, recipe):
         return _train(bench, run_dir, None, [])
 
 
@@ -71,6 +69,10 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     Args:
         run: run directory.
         overrides: ``key=value`` changes to the stored recipe.
+
+    Raises:
+        RunError: another process trains there, or the checkpoint does not fit the
+            overrides; the run is as it was then.
     """
     run_dir, overrides = Path(run), overrides or []
     recipe = load_run_recipe(run_dir, overrides)
@@ -78,7 +80,8 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
         remove_temporaries(run_dir)
         state = None
         if has_checkpoint(run_dir):
-            state = load_checkpoint(run_dir)
+            state = load_checkpoint(run_dir, RESUMED)
+            refuse_changes(state["recipe"], recipe)
             set_aside_newer(run_dir, state["env_steps"])
         else:
             _LOG.warning("%s: stopped before its first checkpoint, from 0", run_dir)
@@ -93,15 +96,51 @@ def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> Recipe
     return expect_kind(load_recipe(path, overrides or []), Recipe, where=str(run_dir))
 
 
+@contextlib.contextmanager
+def new_run(run_dir: Path, recipe: RunRecipe) -> Iterator[None]:
+    """Make the folder of a new run and hold it; nobody else may start one in it.
+
+    Args:
+        run_dir: its folder, existing or not.
+        recipe: what it will train.
+
+    Raises:
+        RunError: it holds a run, another process is at it, or it cannot be written.
+    """
+    with contextlib.ExitStack() as held:
+        with _reported(run_dir):
+            run_dir.mkdir(parents=True, exist_ok=True)
+            held.enter_context(run_lock(run_dir))
+        refuse_old_run(run_dir)  # another process may have just ended one
+        create_run_dir(run_dir, recipe)
+        yield
+
+
+def refuse_old_run(run_dir: Path) -> None:
+    """Raise a RunError when the folder already holds a run."""
+    if (run_dir / RECIPE).exists():
+        raise RunError(
+            f"{run_dir}: already holds a run. Continue it with 'flashdex train "
+            f"--resume {run_dir}', or choose another folder with run_dir=..."
+        )
+
+
 def create_run_dir(run_dir: Path, recipe: RunRecipe) -> None:
     """Make the folder with recipe, versions and the state of the source tree."""
-    try:
+    with _reported(run_dir):
         run_dir.mkdir(parents=True, exist_ok=True)
         write_atomic(run_dir / VERSIONS, json.dumps(versions(), indent=1))
         diff = _git("diff", "HEAD")
         if diff:
             write_atomic(run_dir / "git.diff", diff)
         write_atomic(run_dir / RECIPE, dump_recipe(recipe))
+
+
+@contextlib.contextmanager
+def _reported(run_dir: Path) -> Iterator[None]:
+    """A folder that cannot be written is a mistake of the user."""
+    try:
+        yield
     except OSError as error:
         raise RunError(
             f"{run_dir}: cannot be written ({error.strerror}). Choose another folder "

@@ -58,6 +58,20 @@ def test_other_batch_size_redraws():
     assert noise((2, 5, 3)).shape == (2, 5, 3)
 
 
+@pytest.mark.parametrize("clock", ["shared", "per_env_hand"])
+def test_a_state_of_the_other_clock_does_not_change_the_clock(clock):
+    torch.manual_seed(2)
+    other = "per_env_hand" if clock == "shared" else "shared"
+    saved = NoiseRepetition(clock=other)
+    saved((2, 8, 3))
+    noise = NoiseRepetition(clock=clock)
+    noise.load_state_dict(saved.state_dict())
+    draws = torch.stack([noise((2, 8, 3)) for _ in range(50)])
+    same = (draws[1:] == draws[:-1]).all(-1).flatten(1)
+    together = torch.equal(same.all(1), same.any(1))
+    assert together == (clock == "shared")
+
+
 def test_resume_is_exact():
     generator = torch.Generator().manual_seed(3)
     noise = NoiseRepetition(generator=generator)

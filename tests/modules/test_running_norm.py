@@ -31,6 +31,16 @@ def test_windows_are_normalised_by_channel():
     torch.testing.assert_close(out.std((0, 2), correction=0), torch.ones(3))
 
 
+@pytest.mark.parametrize("before", [0, 7])
+def test_no_rows_change_nothing(before):
+    norm = RunningNorm(3)
+    if before:
+        norm.update(torch.randn(before, 3, 2))
+    kept = {k: v.clone() for k, v in norm.state_dict().items()}
+    norm.update(torch.randn(0, 3, 2))
+    assert all(torch.equal(v, kept[k]) for k, v in norm.state_dict().items())
+
+
 @pytest.mark.parametrize(("value", "expected"), [(3.0, 3.0), (99.0, 10.0)])
 def test_before_any_row_the_input_is_only_clipped(value, expected):
     out = RunningNorm(2)(torch.full((1, 2), value))

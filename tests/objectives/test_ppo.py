@@ -138,6 +138,32 @@ def test_nothing_is_learnt_where_no_row_counts(episode_rows):
     assert all(map(torch.equal, weights(ppo), before))
 
 
+@pytest.mark.parametrize(("given", "expected"), [(3e-4, 7e-5), (1e-5, 1e-5)])
+def test_a_resumed_rate_goes_on_unless_another_one_is_given(given, expected):
+    one, two = make_ppo(lr=3e-4), make_ppo(lr=given)
+    one.rate.fill_(7e-5)  # as steered by the divergence
+    state = one.state_dict()
+    two.load_state_dict(state)
+    assert two.rate.item() == pytest.approx(expected)
+    assert one.rate.item() == pytest.approx(7e-5)
+    # what is stored next belongs to the rate that was given
+    three = make_ppo(lr=given)
+    three.load_state_dict(two.state_dict())
+    assert three.rate.item() == pytest.approx(expected)
+    # and the steps are taken at it: Adam's step is linear in its rate
+    for ppo in (one, two):
+        for parameter in ppo.parameters:
+            parameter.grad = torch.ones_like(parameter)
+    before = [ppo.parameters[0].detach().clone() for ppo in (one, two)]
+    for ppo in (one, two):
+        ppo.optimizer.step()
+    moved = [
+        (ppo.parameters[0].detach() - b).abs().mean()
+        for ppo, b in zip((one, two), before, strict=True)
+    ]
+    assert (moved[1] / moved[0]).item() == pytest.approx(expected / 7e-5, rel=1e-2)
+
+
 def test_rate_follows_the_divergence():
     rate = torch.tensor(1e-3)
     found = [steered_rate(rate, torch.tensor(k), 0.01) for k in (0.021, 0.01, 0.004)]

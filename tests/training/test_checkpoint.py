@@ -29,8 +29,9 @@ from flashdex.training.replay_file import ReplayLog
 CAPACITY = 20
 
 
-def save(folder, steps, **more):
-    return save_checkpoint(folder, {"env_steps": steps}, keep=3, **more)
+def save(folder, steps, *, replay=None, **more):
+    state = {"env_steps": steps, **more}
+    return save_checkpoint(folder, state, keep=3, replay=replay)
 
 
 def make_buffer(capacity=CAPACITY):
@@ -98,8 +99,16 @@ def test_a_checkpoint_of_another_version_is_refused_not_passed_over(tmp_path):
     save(tmp_path, 1)
     path = save(tmp_path, 2)
     torch.save({"env_steps": 2}, path)
-    with pytest.raises(RunError, match="checkpoint format 0, this version reads 1"):
+    with pytest.raises(RunError, match="checkpoint format 0, this version reads 2"):
         load_checkpoint(tmp_path)
+
+
+def test_a_checkpoint_that_lacks_something_is_refused_by_name(tmp_path):
+    path = save(tmp_path, 1, learner={})
+    needs = ("env_steps", "learner", "recipe", "wall_s")
+    with pytest.raises(RunError, match=rf"{path.name}: .* lacks recipe, wall_s\."):
+        load_checkpoint(tmp_path, needs)
+    assert load_checkpoint(tmp_path, needs[:2])["learner"] == {}
 
 
 def test_foreign_code_is_never_unpickled(tmp_path):

@@ -5,57 +5,22 @@ from __future__ import annotations
 import json
 import math
 import re
-import signal
-import sys
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gym_runs import STEPS, TINY, read_metrics, tiny_recipe, trainer_of
 
 from flashdex.cli import main
-from flashdex.errors import FlashdexError
-from flashdex.recipe import AlgoConfig, GymConfig, GymRecipe, LoopConfig, compose
+from flashdex.recipe import GymConfig, GymRecipe, compose
 from flashdex.training.gym import GymWorlds
 from flashdex.training.gym_evaluate import evaluate_policy, observed
-from flashdex.training.gym_loop import GymTrainer
 from flashdex.training.gym_run import make_gym_learner, train_gym
-from flashdex.training.logging import MetricLog
-from flashdex.training.replay_file import ReplayLog
-from flashdex.training.sessions import Start
 
 # The published curves are those of the -v4 environments.
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
-TINY = {
-    "batch_size": 16,
-    "buffer_size": 1000,
-    "min_buffer": 60,
-    "n_step": 1,
-    "actor_width": 16,
-    "critic_width": 16,
-    "num_atoms": 11,
-    "head": "unit",
-    "updates_per_step": 0.25,
-}
-STEPS = 20  # of an episode, below
-
-
-def tiny_recipe(folder, env_id="Pendulum-v1", *, algo=None, train=None, **gym):
-    config = {
-        "max_episode_steps": STEPS,
-        "eval_every_env_steps": 50,
-        "eval_episodes": 3,
-        **gym,
-    }
-    return GymRecipe(
-        name="tiny",
-        total_env_steps=120,
-        run_dir=str(folder),
-        gym=GymConfig(env_id=env_id, **config),
-        algo=AlgoConfig(**{**TINY, **(algo or {})}),
-        train=LoopConfig(**(train or {})),
-    )
 
 
 @pytest.fixture
@@ -70,24 +35,6 @@ def make_recipe(tmp_path):
 def finished(tmp_path_factory):
     """Folder of a run that has reached its budget; not to be changed."""
     return train_gym(tiny_recipe(tmp_path_factory.mktemp("gym") / "run"))
-
-
-def trainer_of(recipe, tmp_path):
-    folder = tmp_path / "loose"
-    folder.mkdir()
-    learner = make_gym_learner(recipe)
-    return GymTrainer(
-        recipe,
-        folder,
-        learner,
-        MetricLog(folder, recipe),
-        start=Start(env_steps=0, wall_s=0.0, lost=0),
-        replay=ReplayLog(folder, learner.buffer, meaning=""),
-    )
-
-
-def read_metrics(folder):
-    return [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "InvertedPendulum-v4"])
@@ -217,70 +164,6 @@ def test_two_runs_of_one_seed_are_equal(finished, make_recipe):
     first, second = (read_metrics(folder)[-1] for folder in (finished, again))
     same = [key for key in first if not key.startswith(("perf/", "hours"))]
     assert {k: first[k] for k in same} == {k: second[k] for k in same}
-
-
-def test_a_signal_ends_the_run_with_a_checkpoint(make_recipe, tmp_path):
-    trainer = trainer_of(make_recipe(eval_every_env_steps=30), tmp_path)
-
-    class Killer:
-        def write(self, record):
-            signal.raise_signal(signal.SIGTERM)
-
-        def close(self):
-            pass
-
-    trainer.log.writers.append(Killer())
-    assert trainer.run() == "signal"
-    assert trainer.env_steps == 31  # the record of step 30 brought the signal
-    assert (trainer.run_dir / "checkpoints" / f"{31:012d}.pt").is_file()
-
-
-def test_a_wall_limit_ends_the_run(make_recipe):
-    folder = train_gym(make_recipe(train={"wall_limit_s": 1e-6}))
-    assert read_metrics(folder)[-1]["env_steps"] == 1
-
-
-class Unbounded(gymnasium.Env):
-    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "expected"),
-    [
-        ("HalfCheeta-v4", "HalfCheetah"),
-        ("HalfCheetah-v99", "cannot be made"),
-        ("CartPole-v1", "only continuous actions"),
-        ("FrozenLake-v1", "only flat vectors"),
-        ("Unbounded-v0", "gym.rescale_actions=false"),
-    ],
-)
-def test_environments_that_cannot_be_used_exit_two(env_id, expected, tmp_path, capsys):
-    if "Unbounded-v0" not in gymnasium.registry:
-        gymnasium.register("Unbounded-v0", Unbounded)
-    folder = tmp_path / "run"
-    words = [f"gym.env_id={env_id}", f"run_dir={folder}"]
-    assert main(["train", "gym_halfcheetah_small", *words]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("flashdex train: gym.")
-    assert expected in err
-    assert not folder.exists()
-
-
-def test_the_missing_package_is_named_with_its_extra(monkeypatch, make_recipe):
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(FlashdexError, match=r"pip install 'flashdex\[gym\]'"):
-        train_gym(make_recipe())
-
-
-def test_changed_networks_do_not_resume(finished, capsys):
-    before = (finished / "recipe.yaml").read_text()
-    words = ["--resume", str(finished), "algo.critic_width=24", "total_env_steps=200"]
-    assert main(["train", *words]) == 2
-    assert "does not fit the recipe" in capsys.readouterr().err
-    assert main(["evaluate", str(finished), "algo.critic_width=24"]) == 2
-    assert "does not fit the recipe" in capsys.readouterr().err
-    assert (finished / "recipe.yaml").read_text() == before
 
 
 def test_other_verbs_refuse_a_run_without_motions(finished, capsys):

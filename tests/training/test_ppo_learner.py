@@ -238,9 +238,10 @@ def test_another_algorithm_s_checkpoint_is_refused(make_ppo, make_bench):
         learner.load_state_dict(state)
 
 
-def test_a_run_trains_and_is_evaluated(make_ppo, library, tmp_path):
+@pytest.fixture
+def ppo_run(make_ppo, library, tmp_path):
+    """A run of three rollouts, two of them learnt from."""
     from flashdex.recipe import validate
-    from flashdex.training.evaluate import evaluate
     from flashdex.training.run import train
 
     recipe = dataclasses.replace(
@@ -250,8 +251,31 @@ def test_a_run_trains_and_is_evaluated(make_ppo, library, tmp_path):
         motions=MotionsConfig(library=str(library.path)),
         train=TrainConfig(certify=False, render_conversions=False),
     )
-    run = train(validate(recipe))
-    assert load_checkpoint(run)["learner"]["updates"] == 2
-    result = evaluate(run)
+    return train(validate(recipe))
+
+
+def test_a_run_trains_and_is_evaluated(ppo_run, library):
+    from flashdex.training.evaluate import evaluate
+
+    assert load_checkpoint(ppo_run)["learner"]["updates"] == 2
+    result = evaluate(ppo_run)
     assert [row["motion"] for row in result.rows] == library.names
     assert result.totals["env_steps"] == WORLDS * HORIZON * 3
+    assert evaluate(ppo_run, ["env.num_envs=4"]) == result
+    with pytest.raises(RunError, match="does not fit the recipe"):
+        evaluate(ppo_run, ["algo.ppo.hidden=[32]"])
+
+
+def test_a_resume_takes_another_learning_rate(ppo_run):
+    from flashdex.training.run import resume
+
+    def rates():
+        agents = load_checkpoint(ppo_run)["learner"]["agents"]
+        return [a["optimizer"]["param_groups"][0]["lr"].item() for a in agents.values()]
+
+    steered = rates()
+    total = 2 * load_checkpoint(ppo_run)["env_steps"]
+    words = ["algo.ppo.lr=2e-5", "algo.ppo.target_kl=null"]
+    resume(ppo_run, [f"total_env_steps={total}", *words])
+    assert min(steered) > 2e-5
+    assert rates() == pytest.approx([2e-5] * len(steered))

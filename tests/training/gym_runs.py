@@ -1,0 +1,60 @@
+"""Tiny runs on stock environments."""
+
+from __future__ import annotations
+
+import json
+
+from flashdex.recipe import AlgoConfig, GymConfig, GymRecipe, LoopConfig
+from flashdex.training.gym_loop import GymTrainer
+from flashdex.training.gym_run import make_gym_learner
+from flashdex.training.logging import MetricLog
+from flashdex.training.replay_file import ReplayLog
+from flashdex.training.sessions import Start
+
+TINY = {
+    "batch_size": 16,
+    "buffer_size": 1000,
+    "min_buffer": 60,
+    "n_step": 1,
+    "actor_width": 16,
+    "critic_width": 16,
+    "num_atoms": 11,
+    "head": "unit",
+    "updates_per_step": 0.25,
+}
+STEPS = 20  # of an episode, below
+
+
+def tiny_recipe(folder, env_id="Pendulum-v1", *, algo=None, train=None, **gym):
+    config = {
+        "max_episode_steps": STEPS,
+        "eval_every_env_steps": 50,
+        "eval_episodes": 3,
+        **gym,
+    }
+    return GymRecipe(
+        name="tiny",
+        total_env_steps=120,
+        run_dir=str(folder),
+        gym=GymConfig(env_id=env_id, **config),
+        algo=AlgoConfig(**{**TINY, **(algo or {})}),
+        train=LoopConfig(**(train or {})),
+    )
+
+
+def trainer_of(recipe, tmp_path):
+    folder = tmp_path / "loose"
+    folder.mkdir(parents=True)
+    learner = make_gym_learner(recipe)
+    return GymTrainer(
+        recipe,
+        folder,
+        learner,
+        MetricLog(folder, recipe),
+        start=Start(env_steps=0, wall_s=0.0, lost=0),
+        replay=ReplayLog(folder, learner.buffer, meaning=""),
+    )
+
+
+def read_metrics(folder):
+    return [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]

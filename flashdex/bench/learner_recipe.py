@@ -83,8 +83,9 @@ def _one_update(learner: FlashSACLearner) -> dict[str, float]:
         call()
         times[phase] = time.perf_counter() - start
 
-    state, _ = learner.codec.unpack(learner.buffer.sample(learner.config.batch_size))
-    clock("sample", lambda: learner.codec.unpack(learner.buffer.sample(learner.config.batch_size)))
+    rows = learner.config.batch_size
+    state, _ = learner.codec.unpack(learner.buffer.sample(rows))
+    clock("sample", lambda: learner.codec.unpack(learner.buffer.sample(rows)))
     clock("assemble", lambda: assemble(learner.sample_transforms, state))
     clock("whole", learner.update)
     times["learn"] = times["whole"] - times["sample"] - times["assemble"]

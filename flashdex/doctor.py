@@ -176,7 +176,9 @@ def _extras() -> list[Finding]:
     for extra, names in extras.items():
         absent = [name for name in names if _version(name) is None]
         if absent:
-            detail = f"without {', '.join(absent)}: pip install 'flashdex[{extra}]'"
+            detail = (
+                f"without {', '.join(absent)}: pip install '.[{extra}]' in the clone"
+            )
             found.append(Finding("note", f"extra {extra}", detail))
         else:
             found.append(Finding("ok", f"extra {extra}", ", ".join(names)))

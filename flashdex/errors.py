@@ -85,5 +85,5 @@ class MissingExtraError(FlashdexError):
     def __init__(self, package: str, *, extra: str) -> None:
         super().__init__(
             f"'{package}' is not installed. It is needed here and comes with the "
-            f"extra '{extra}': pip install 'flashdex[{extra}]'"
+            f"extra '{extra}': pip install '.[{extra}]' in the clone"
         )

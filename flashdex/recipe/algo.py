@@ -132,7 +132,7 @@ class LoopConfig:
     log_every_s: float = number(5.0, above=0)
     """Seconds between log records."""
     wall_limit_s: float | None = number(None, above=0)
-    """Stop cleanly after this many seconds; null = never."""
+    """Stop cleanly after this many seconds, all sessions together; null = never."""
     torch_threads: int = number(0, low=0)
     """Threads of the learner on a CPU; 0 = torch's choice. With small networks more
     threads wait for each other longer than they compute."""

@@ -10,8 +10,10 @@ from omegaconf import OmegaConf
 from flashdex.errors import RunError
 from flashdex.recipe import RunRecipe
 
-# The networks and reward statistics of either algorithm mean nothing under others.
-FIXED = ("algo.kind", "algo.groups", "algo.v_max")
+# What the records so far were made with, and what the networks and reward statistics
+# of either algorithm mean.
+LABELS = ("name", "ablation", "seed", "run_dir")
+FIXED = (*LABELS, "algo.kind", "algo.groups", "algo.v_max")
 FIXED_FLASHSAC = (
     *FIXED,
     "algo.head",

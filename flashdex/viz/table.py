@@ -47,8 +47,10 @@ def run_table(run_dir: str | Path) -> str:
 def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     counts, recipe = count(rows), run.recipe
     converted = counts["converted"]
+    ablation = recipe.get("ablation", "none")
+    shown = "" if ablation == "none" else f"  ablation {ablation}"
     return [
-        f"{recipe.get('name', run.path.name)}  hand {recipe.get('hand', '?')}  "
+        f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  "
         f"seed {recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
         f"{duration(run.wall_s)}",

@@ -209,7 +209,7 @@ def test_environments_that_cannot_be_used_exit_two(env_id, expected, tmp_path, c
 
 def test_the_missing_package_is_named_with_its_extra(monkeypatch, make_recipe):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(FlashdexError, match=r"pip install 'flashdex\[gym\]'"):
+    with pytest.raises(FlashdexError, match=r"pip install '\.\[gym\]'"):
         train_gym(make_recipe())
 
 

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -16,14 +15,13 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.base import assemble
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
-from flashdex.training.checkpoint import snapshot
 from flashdex.training.guard import finite_rows
 from flashdex.training.hand_groups import HandGroups
-from flashdex.training.nstep import NStepAssembler
+from flashdex.training.replay_learner import ReplayLearner
 from flashdex.training.rows import RowCodec
 
 
-class FlashSACLearner:
+class FlashSACLearner(ReplayLearner):
     """The paper's learner; see `flashdex.training.learner.Learner` for its contract.
 
     Args:
@@ -35,8 +33,6 @@ class FlashSACLearner:
         seed: of networks, exploration and replay.
     """
 
-    is_off_policy = True
-
     def __init__(
         self,
         config: AlgoConfig,
@@ -47,15 +43,15 @@ class FlashSACLearner:
         total_updates: int,
         seed: int,
     ) -> None:
-        self.config, self.bank = config, bank
+        self.bank = bank
         self.groups = HandGroups.of(bank, unified=config.groups == "unified")
         self.transforms = transforms
         self.sample_transforms = [t.clone() for t in transforms]
-        self.generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
         torch.manual_seed(seed)
         shown = assemble(transforms, example)
         future = shown.get(keys.FUTURE, None)
-        self.agent = FlashSACAgent(
+        agent = FlashSACAgent(
             config,
             observation_dim=shown[keys.OBSERVATION].shape[-1],
             future_shape=None if future is None else tuple(future.shape[1:]),
@@ -63,45 +59,19 @@ class FlashSACLearner:
             groups=self.groups.names,
             num_envs=example.batch_size[0],
             total_updates=total_updates,
-            generator=self.generator,
+            generator=generator,
             quiet=keys.ATTEMPT,
         )
-        self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
+        super().__init__(config, agent, generator)
         self.codec = RowCodec(bank)
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(config.buffer_size),
-            generator=self.generator,
-        )
-        self._debt = 0.0
         self._planned = 1  # updates until rows are added
         self._ahead: list[TensorDict] = []  # samples of those updates
-        self.num_dropped = 0  # rows that were not finite
         self.last_update: dict[str, Any] | None = None
 
-    @property
-    def ready(self) -> bool:
-        """Whether the replay buffer holds enough rows to learn from."""
-        return len(self.buffer) >= self.config.min_buffer
-
-    @property
-    def updates(self) -> int:
-        """Critic updates performed so far."""
-        return self.agent.stepper.updates
-
-    @property
-    def num_rows(self) -> int:
-        """Rows of the replay buffer."""
-        return len(self.buffer)
-
     def due(self) -> int:
-        """Updates to perform now; a fraction is carried to the next vector step."""
-        if not self.ready:
-            return 0
-        self._debt += self.config.updates_per_step
-        whole = int(self._debt)
-        self._debt -= whole
-        self._planned = whole
-        return whole
+        """Updates to perform now; their samples will be assembled at once."""
+        self._planned = super().due()
+        return self._planned
 
     @torch.no_grad()
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
@@ -214,30 +184,3 @@ class FlashSACLearner:
         self.generator.set_state(update["generator"])
         batch = TensorDict(update["batch"], batch_size=[update["batch_size"]])
         return self.agent.update(batch)
-
-    def forget_episodes(self) -> None:
-        """Drop the open n-step window and the running returns."""
-        self.nstep.clear()
-        self.agent.normalizer.clear_returns()
-
-    def state_dict(self) -> dict[str, Any]:
-        """A copy of agent, n-step tail and update debt; replay rows are no part of it.
-
-        The generator is the agent's: it also draws the replay samples.
-        """
-        state = {
-            "agent": self.agent.state_dict(),
-            "nstep": self.nstep.state_dict(),
-            "debt": self._debt,
-            "dropped": self.num_dropped,
-        }
-        return snapshot(state)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a copy of ``state_dict``."""
-        # Adam keeps the very tensors it is given: two learners would share them.
-        state = snapshot(state)
-        self.agent.load_state_dict(state["agent"])
-        self.nstep.load_state_dict(state["nstep"])
-        self._debt = state["debt"]
-        self.num_dropped = state["dropped"]

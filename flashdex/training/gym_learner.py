@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flashdex import keys
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
 from flashdex.training.guard import finite_rows
-from flashdex.training.nstep import NStepAssembler
+from flashdex.training.replay_learner import ReplayLearner
 
 NEXT_OBSERVATION = "next_observation"
 
 
-class GymLearner:
+class GymLearner(ReplayLearner):
     """FlashSAC for one agent; see `flashdex.training.learner.Learner`.
 
     A state is a TensorDict (N,) with the ``observation`` (N, D); actions are (N, A) in
@@ -34,8 +31,6 @@ class GymLearner:
         seed: of networks, exploration and replay.
     """
 
-    is_off_policy = True
-
     def __init__(
         self,
         config: AlgoConfig,
@@ -46,49 +41,17 @@ class GymLearner:
         total_updates: int,
         seed: int,
     ) -> None:
-        self.config = config
-        self.generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
         torch.manual_seed(seed)  # initial weights are drawn from the global stream
-        self.agent = FlashSACAgent(
+        agent = FlashSACAgent(
             config,
             observation_dim=observation_dim,
             action_dim=action_dim,
             num_envs=num_envs,
             total_updates=total_updates,
-            generator=self.generator,
+            generator=generator,
         )
-        self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(config.buffer_size),
-            batch_size=config.batch_size,
-            generator=self.generator,
-        )
-        self._debt = 0.0
-        self.num_dropped = 0  # rows that were not finite
-
-    @property
-    def ready(self) -> bool:
-        """Whether the replay buffer holds enough rows to learn from."""
-        return len(self.buffer) >= self.config.min_buffer
-
-    @property
-    def updates(self) -> int:
-        """Critic updates performed so far."""
-        return self.agent.stepper.updates
-
-    @property
-    def num_rows(self) -> int:
-        """Rows of the replay buffer."""
-        return len(self.buffer)
-
-    def due(self) -> int:
-        """Updates to perform now; a fraction is carried to the next vector step."""
-        if not self.ready:
-            return 0
-        self._debt += self.config.updates_per_step
-        whole = int(self._debt)
-        self._debt -= whole
-        return whole
+        super().__init__(config, agent, generator)
 
     @torch.no_grad()
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
@@ -148,7 +111,7 @@ class GymLearner:
 
     def sample(self) -> TensorDict:
         """A replay sample as the loss reads it, batch (B,)."""
-        row = self.buffer.sample()
+        row = self.buffer.sample(self.config.batch_size)
         return TensorDict(
             {
                 keys.OBSERVATION: row[keys.OBSERVATION],
@@ -166,24 +129,3 @@ class GymLearner:
     def update(self) -> TensorDict:
         """One FlashSAC update on a fresh sample; returns its metrics."""
         return self.agent.update(self.sample())
-
-    def forget_episodes(self) -> None:
-        """Drop the open n-step window and the running returns."""
-        self.nstep.clear()
-        self.agent.normalizer.clear_returns()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Agent, n-step tail and update debt; the replay rows are not part of it."""
-        return {
-            "agent": self.agent.state_dict(),
-            "nstep": self.nstep.state_dict(),
-            "debt": self._debt,
-            "dropped": self.num_dropped,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``."""
-        self.agent.load_state_dict(state["agent"])
-        self.nstep.load_state_dict(state["nstep"])
-        self._debt = state["debt"]
-        self.num_dropped = state.get("dropped", 0)  # older checkpoints have no such key

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -57,6 +57,16 @@ class HumanDemo:
         licence: of the recording.
         up: which axis of the recording's world points up.
         support_z: height of the table in the recording's world, m, if known.
+        needs_cutting: a session of many actions, to be cut where contact begins and
+            ends; otherwise one action that is used whole.
+        split: of the dataset's own partition (train, test, ...), if it has one.
+        task: what is done, in the dataset's words, if it says so.
+        provenance: files, frame range, and what the reader decided; goes into the
+            library's manifest, so JSON values only.
+
+    A frame in which a hand or an object was not tracked holds NaN in all its tracks.
+    ``flashdex.motions.repair`` closes short gaps and cuts at long ones before a motion
+    is validated.
     """
 
     name: str
@@ -69,6 +79,10 @@ class HumanDemo:
     licence: str = ""
     up: Literal["z", "y", "-y"] = "z"
     support_z: float | None = None
+    needs_cutting: bool = False
+    split: str = ""
+    task: str = ""
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -173,17 +187,16 @@ class HumanDemo:
             end: one past the last frame.
             name: of the piece.
         """
-        return HumanDemo(
+        first = self.provenance.get("frames", [0])[0]
+        return replace(
+            self,
             name=name,
-            fps=self.fps,
             keypoints={s: k[start:end] for s, k in self.keypoints.items()},
             palm={s: p[start:end] for s, p in self.palm.items()},
             objects=[
                 DemoObject(b.name, b.mesh, b.pose[start:end]) for b in self.objects
             ],
             hand_object=dict(self.hand_object),
-            source=self.source,
-            licence=self.licence,
-            up=self.up,
-            support_z=self.support_z,
+            needs_cutting=False,
+            provenance=self.provenance | {"frames": [first + start, first + end]},
         )

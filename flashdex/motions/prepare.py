@@ -25,7 +25,8 @@ from flashdex.motions.library_writer import LibraryWriter
 from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.process import MotionSettings, Prepared, prepare_motion
 from flashdex.motions.residuals import RetargetWeights
-from flashdex.motions.sources import read_source
+from flashdex.motions.recording import SourceOptions
+from flashdex.motions.sources import list_recordings
 
 PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
@@ -74,7 +75,8 @@ def prepare(
         4
     """
     load_hand(hand)  # refuses an unknown name before anything is read
-    demos = read_source(source, input, seed=seed, limit=limit)
+    options = SourceOptions(path=input, seed=seed, limit=limit)
+    demos = [d for r in list_recordings(source, options) for d in r.read()]
     settings = MotionSettings(
         hand=hand,
         control_hz=control_hz,

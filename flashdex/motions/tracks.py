@@ -39,12 +39,18 @@ def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
     y = z x x.
 
     Args:
-        keypoints: m, world, (T, 21, 3).
+        keypoints: m, world, (T, 21, 3); NaN where a frame was not tracked.
         side: of the hand.
 
     Returns:
-        Wrist position and quaternion wxyz, (T, 7).
+        Wrist position and quaternion wxyz, (T, 7), NaN in the same frames.
     """
+    seen = np.isfinite(keypoints).all(axis=(1, 2))
+    if not seen.all():
+        out = np.full((len(keypoints), 7), np.nan)
+        if seen.any():
+            out[seen] = palm_frame(keypoints[seen], side)
+        return out
     wrist, index, middle, pinky = (keypoints[:, i] for i in (0, 5, 9, 17))
     x = _unit(middle - wrist)
     normal = np.cross(index - wrist, pinky - wrist)

@@ -1,7 +1,7 @@
 """Reads recordings given as hand keypoints and object poses, one .npz a recording.
 
 Keys: ``fps``, ``object`` (the mesh is ``meshes/<object>.obj`` beside the file),
-``obj_pose`` (T, 7), and per recorded hand ``kp_left`` (T, 21, 3) and, if known,
+``obj_pose`` (T, 7) (several objects: N names and (T, N, 7)), and per recorded hand ``kp_left`` (T, 21, 3) and, if known,
 ``palm_left`` (T, 7); right likewise. Metres, quaternions wxyz, z up. A
 ``segments*.json`` beside the files (a list of clip, start, end; end excluded) cuts
 recordings into motions called ``<clip>_<start>_<end>``.
@@ -10,6 +10,8 @@ recordings into motions called ``<clip>_<start>_<end>``.
 from __future__ import annotations
 
 import json
+import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy as np
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
+from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
 
@@ -24,17 +27,14 @@ REQUIRED = ("fps", "object", "obj_pose")
 SOURCE = "keypoints"
 
 
-def read_keypoints(path: str | Path, *, limit: int | None = None) -> list[HumanDemo]:
+def list_keypoints(options: SourceOptions) -> list[Recording]:
     """Recordings of a folder or one file, in name order.
 
-    Args:
-        path: a folder of .npz files, or one of them.
-        limit: at most this many motions.
-
     Raises:
-        DemoError: says what is missing, and where.
+        DemoError: there are none, or a ``segments*.json`` is wrong.
     """
-    path = Path(path)
+    path = options.path
+    assert path is not None  # ``Source.needs``
     files = [path] if path.is_file() else sorted(path.glob("*.npz"))
     if not files:
         raise DemoError(
@@ -42,14 +42,29 @@ def read_keypoints(path: str | Path, *, limit: int | None = None) -> list[HumanD
             f"meshes/<object>.obj, or one such file."
         )
     segments = _read_segments(files[0].parent)
-    demos: list[HumanDemo] = []
-    for file in files:
-        if limit is not None and len(demos) >= limit:
-            break
-        demo = read_file(file)
-        pieces = segments.get(file.stem)
-        demos += [demo] if pieces is None else _cut(demo, pieces)
-    return demos[:limit]
+    lists = tuple(sorted(files[0].parent.glob("segments*.json")))
+    return [
+        Recording(
+            name=file.stem,
+            read=partial(read_recording, file, segments.get(file.stem)),
+            files=(file, *_mesh_files(file), *lists),
+        )
+        for file in files
+    ]
+
+
+def read_recording(
+    file: Path, pieces: list[tuple[int, int]] | None = None
+) -> list[HumanDemo]:
+    """One recording, cut into pieces (frames from, to) if there are any."""
+    demo = read_file(file)
+    return [demo] if pieces is None else _cut(demo, pieces)
+
+
+def read_keypoints(path: str | Path) -> list[HumanDemo]:
+    """All motions of a folder or file, read at once."""
+    recordings = list_keypoints(SourceOptions(path=Path(path)))
+    return [demo for recording in recordings for demo in recording.read()]
 
 
 def read_file(file: Path) -> HumanDemo:
@@ -57,7 +72,7 @@ def read_file(file: Path) -> HumanDemo:
     try:
         with np.load(file, allow_pickle=False) as stored:
             data = {key: stored[key] for key in stored.files}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise DemoError(
             f"{file}: not a readable .npz without pickles: {error}"
         ) from error
@@ -69,32 +84,62 @@ def read_file(file: Path) -> HumanDemo:
     keypoints: dict[Side, np.ndarray] = {
         s: data[f"kp_{s}"].astype(np.float64) for s in hands
     }
-    name = str(data["object"])
     licence = file.parent / "LICENSE"
     return HumanDemo(
         name=file.stem,
         fps=float(data["fps"]),
         keypoints=keypoints,
-        palm={s: _palm(data, s, keypoints) for s in hands},
-        objects=[
-            DemoObject(
-                name,
-                file.parent / "meshes" / f"{name}.obj",
-                data["obj_pose"].astype(np.float64),
-            )
-        ],
+        palm={s: _read_palm(data, s, keypoints) for s in hands},
+        objects=_read_objects(file, data),
         source=SOURCE,
         licence=str(licence.name) if licence.is_file() else "",
+        provenance={"files": [file.name]},
     )
 
 
-def _palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.ndarray:
+def _read_palm(
+    data: dict, side: Side, keypoints: dict[Side, np.ndarray]
+) -> np.ndarray:
     stored, points = data.get(f"palm_{side}"), keypoints[side]
     if stored is not None:
         return stored.astype(np.float64)
-    if points.ndim != 3 or points.shape[1:] != (21, 3) or not np.isfinite(points).all():
+    if points.ndim != 3 or points.shape[1:] != (21, 3):
         return np.full((len(points), 7), np.nan)  # validation says what is wrong
     return palm_frame(points, side)
+
+
+def _read_objects(file: Path, data: dict) -> list[DemoObject]:
+    """One object with ``obj_pose`` (T, 7), or several with (T, N, 7)."""
+    names = [str(name) for name in np.atleast_1d(data["object"])]
+    poses = data["obj_pose"].astype(np.float64)
+    if poses.ndim == 2:
+        poses = poses[:, None]
+    if poses.ndim != 3 or poses.shape[1] != len(names):
+        raise DemoError(
+            f"{file}: obj_pose has shape {data['obj_pose'].shape}; expected (T, 7), or "
+            f"(T, {len(names)}, 7) for the {len(names)} objects {', '.join(names)}."
+        )
+    return [
+        DemoObject(name, _mesh_file(file, name), poses[:, i])
+        for i, name in enumerate(names)
+    ]
+
+
+def _mesh_file(file: Path, name: str) -> Path:
+    if name != Path(name).name:
+        raise DemoError(f"{file}: object '{name}' must be a plain name, not a path.")
+    return file.parent / "meshes" / f"{name}.obj"
+
+
+def _mesh_files(file: Path) -> tuple[Path, ...]:
+    """Meshes that a recording names; none where it cannot be read (yet)."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            names = [str(name) for name in np.atleast_1d(stored["object"])]
+        meshes = [_mesh_file(file, name) for name in names]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, DemoError):
+        return ()
+    return tuple(mesh for mesh in meshes if mesh.is_file())
 
 
 def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
@@ -134,3 +179,9 @@ def _support(demo: HumanDemo) -> float | None:
     poses = [b.pose for b in demo.objects]
     height, found = estimate_support(poses, vertices, demo.fps)
     return height if found else None
+
+
+KEYPOINTS = Source(
+    list=list_keypoints,
+    about="a folder of <clip>.npz with keypoints and object poses, or one such file",
+)

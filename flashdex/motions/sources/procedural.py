@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from flashdex.errors import UnknownSourceError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
+from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.carry import CarryPlan, Track, carry_track
 from flashdex.motions.sources.shapes import SHAPES
 from flashdex.motions.tracks import continuous, palm_frame, to_quat
@@ -91,20 +93,35 @@ def procedural(
     Returns:
         Motions named by their kind; repetitions get a number.
     """
+    listed = _list(seed, count, kinds)
+    return [demo for recording in listed for demo in recording.read()]
+
+
+def _list(seed: int, count: int | None, kinds: Sequence[str]) -> list[Recording]:
     for kind in kinds:
         if kind not in KINDS:
             raise UnknownSourceError(kind, KINDS, where="procedural motions")
     count = len(kinds) if count is None else count
-    demos = []
+    listed = []
     for i in range(count):
-        kind, again = KINDS[kinds[i % len(kinds)]], i // len(kinds)
-        name = kind.name if count <= len(kinds) else f"{kind.name}_{again:02d}"
-        key = list(kind.name.encode())
-        demos.append(_make(kind, name, np.random.default_rng([seed, again, *key])))
-    return demos
+        kind, again = kinds[i % len(kinds)], i // len(kinds)
+        name = kind if count <= len(kinds) else f"{kind}_{again:02d}"
+        read = partial(_make, kind, name, seed, again)
+        listed.append(Recording(name=name, read=read, key=f"{seed} {again}"))
+    return listed
 
 
-def _make(kind: Kind, name: str, rng: np.random.Generator) -> HumanDemo:
+def list_procedural(options: SourceOptions) -> list[Recording]:
+    """``path`` chooses: quickstart (default), all, or kinds separated by commas."""
+    chosen = str(options.path or "quickstart")
+    presets = {"quickstart": list(QUICKSTART), "all": list(KINDS)}
+    kinds = presets.get(chosen) or [k.strip() for k in chosen.split(",")]
+    return _list(options.seed, options.limit, kinds)
+
+
+def _make(name_of_kind: str, name: str, seed: int, again: int) -> list[HumanDemo]:
+    kind = KINDS[name_of_kind]
+    rng = np.random.default_rng([seed, again, *kind.name.encode()])
     tracks: dict[Side, Track] = {}
     bodies: dict[Side, tuple[str, trimesh.Trimesh]] = {}
     for side, shape_name in kind.shapes.items():
@@ -121,7 +138,7 @@ def _make(kind: Kind, name: str, rng: np.random.Generator) -> HumanDemo:
         quats = continuous(to_quat(track.object_rot))
         pose = np.concatenate([track.object_pos, quats], axis=1)[:frames]
         objects.append(DemoObject(*bodies[side], pose))
-    return HumanDemo(
+    demo = HumanDemo(
         name=name,
         fps=FPS,
         keypoints=keypoints,
@@ -131,7 +148,10 @@ def _make(kind: Kind, name: str, rng: np.random.Generator) -> HumanDemo:
         source=SOURCE,
         licence=LICENCE,
         support_z=0.0,
+        task=kind.action,
+        provenance={"seed": seed, "again": again},
     )
+    return [demo]
 
 
 def _plan(kind: Kind, rng: np.random.Generator) -> CarryPlan:
@@ -169,3 +189,11 @@ def smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray
     smooth = gaussian_filter1d(white, sigma, axis=0)[pad:-pad]
     # variance that a Gaussian filter of this width leaves of white noise
     return smooth * np.sqrt(2 * np.sqrt(np.pi) * sigma)
+
+
+PROCEDURAL = Source(
+    list=list_procedural,
+    about="nothing: makes motions up. --input quickstart, all, or kinds with commas",
+    licence=LICENCE,
+    needs=(),
+)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
 
 
 @contextmanager
@@ -45,3 +52,41 @@ def write_atomic(path: Path, text: str) -> None:
     """
     with open_atomic(path) as file:
         file.write(text.encode("utf-8"))
+
+
+@contextmanager
+def waiting_lock(path: Path) -> Iterator[None]:
+    """Hold ``<path>.lock`` while the block runs; other processes wait for it.
+
+    It goes with the process, however that ends. Without file locks, or where the file
+    cannot be made, the block runs without one.
+
+    Args:
+        path: what is being made; its directory is made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.with_name(f".{path.name}.lock").open("w")
+    except OSError:
+        yield
+        return
+    with file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError:
+                pass  # a file system without locks
+        yield
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file's content; read once while size and time stay the same."""
+    stat = path.stat()
+    return _hash_file(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _hash_file(path: Path, size: int, changed: int) -> str:
+    del size, changed  # they are part of the cache's key only
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

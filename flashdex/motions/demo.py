@@ -94,8 +94,12 @@ class HumanDemo:
         """Duration, s."""
         return self.num_frames / self.fps
 
-    def validate(self) -> None:
+    def validate(self, *, complete: bool = True) -> None:
         """Refuse a recording that cannot be used.
+
+        Args:
+            complete: every frame must be tracked, and there must be enough of them;
+                before repair, only what repair cannot mend counts.
 
         Raises:
             DemoError: names the motion, the track and the first frame at fault.
@@ -109,10 +113,11 @@ class HumanDemo:
         if not np.isfinite(self.fps) or self.fps <= 0:
             raise DemoError(f"{self.name}: fps is {self.fps}; it must be positive.")
         self._check_shapes()
-        self._check_values()
         for body in self.objects:
             self._check_mesh(body)
-        self._check_length()
+        if complete:
+            self._check_values()
+            self._check_length()
 
     def _check_shapes(self) -> None:
         frames = self.num_frames

@@ -31,6 +31,8 @@ FRAME_KEYS = (
     "object_linvel",
     "object_angvel",
 )
+# How good the reference is, frame by frame; for reports, no training reads it.
+QUALITY_KEYS = ("tip_error", "penetration", "contact")
 
 
 @dataclass
@@ -46,6 +48,9 @@ class MotionLibrary:
         motions: one row a motion.
         objects: one row an object.
         manifest: names, sources, licences, hashes, versions.
+        quality: one row a frame: ``tip_error`` (2, 5), m, robot pad to human tip;
+            ``penetration`` (), m, deepest contact of a hand with an object;
+            ``contact`` (2, 5), human fingers in contact. None in older libraries.
 
     Example:
         >>> library = MotionLibrary.load("libraries/quickstart")  # doctest: +SKIP
@@ -57,6 +62,7 @@ class MotionLibrary:
     motions: TensorDict
     objects: TensorDict
     manifest: dict[str, Any]
+    quality: TensorDict | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> MotionLibrary:
@@ -77,6 +83,8 @@ class MotionLibrary:
                     f"{path}: '{part}' is missing. Prepare it again: flashdex prepare"
                 )
             parts[part] = TensorDict.load_memmap(path / part)
+        if (path / "quality" / "meta.json").is_file():
+            parts["quality"] = TensorDict.load_memmap(path / "quality")
         library = cls(path=path, manifest=manifest, **parts)
         library._check()
         return library

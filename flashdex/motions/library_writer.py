@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
 from flashdex.keys import FINGERS, SIDES
-from flashdex.motions.library import FRAME_KEYS, SCHEMA
+from flashdex.motions.library import FRAME_KEYS, QUALITY_KEYS, SCHEMA
 from flashdex.motions.objects import ObjectAsset
 
 CONVENTIONS = {
@@ -42,6 +42,7 @@ class MotionRecord:
         objects: objects by slot; at most as many as there are slots.
         support_disks: [x, y, z_top, radius, height], m, NaN unused, (4, 5).
         info: what the manifest says about it (source, licence, status, figures).
+        quality: every key of ``QUALITY_KEYS``, (T, ...), or nothing.
     """
 
     name: str
@@ -51,6 +52,7 @@ class MotionRecord:
     objects: list[ObjectAsset]
     support_disks: np.ndarray
     info: dict[str, Any] = field(default_factory=dict)
+    quality: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class LibraryWriter:
@@ -85,8 +87,10 @@ class LibraryWriter:
             )
         if record.name in {r.name for r in self._records}:
             raise LibraryError(f"two motions are called '{record.name}'.")
-        for asset in record.objects:
-            self._objects.setdefault(asset.sha256, asset)
+        # equal objects become one, or a large collection does not fit into memory
+        record.objects = [
+            self._objects.setdefault(asset.sha256, asset) for asset in record.objects
+        ]
         self._records.append(record)
 
     def write(self, *, report: str = "") -> Path:
@@ -137,6 +141,8 @@ class LibraryWriter:
             raise OSError(
                 errno.ENOSPC, f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
             )
+        if all(r.quality for r in self._records):
+            tables["quality"] = self._stack_quality()
         for name, table in tables.items():
             table.memmap(str(work / name))
         manifest = self._manifest | {
@@ -157,6 +163,13 @@ class LibraryWriter:
         total = len(stacked["joint_pos"])
         tensors = {k: torch.as_tensor(v).float() for k, v in stacked.items()}
         return TensorDict(tensors, batch_size=[total])
+
+    def _stack_quality(self) -> TensorDict:
+        tensors = {
+            k: torch.as_tensor(np.concatenate([r.quality[k] for r in self._records]))
+            for k in QUALITY_KEYS
+        }
+        return TensorDict(tensors, batch_size=[len(tensors["contact"])])
 
     def _stack_motions(self) -> TensorDict:
         lengths = torch.tensor([len(r.frames["joint_pos"]) for r in self._records])

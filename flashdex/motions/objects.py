@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from flashdex.files import waiting_lock
 from flashdex.motions.convex import compute_convex_parts, compute_mass_properties
 from flashdex.motions.meshes import (
     clean_mesh,
@@ -140,8 +141,11 @@ def make_object(
     file = (cache_dir or default_cache_dir()) / "objects" / f"{key}.npz"
     values = read_cache(file, required=_COMPUTED)
     if values is None:
-        values = _compute(mesh, settings, where)
-        write_cache(file, values)
+        with waiting_lock(file):  # two workers often meet the same object at once
+            values = read_cache(file, required=_COMPUTED)
+            if values is None:
+                values = _compute(mesh, settings, where)
+                write_cache(file, values)
     if not values["watertight"]:
         logger.warning(
             "%s: the mesh is not watertight; volume, mass and inertia come from its "
@@ -149,6 +153,21 @@ def make_object(
             where,
         )
     return ObjectAsset(name=name or "object", sha256=key, **values)
+
+
+def read_object(sha256: str, *, name: str, cache_dir: Path) -> ObjectAsset | None:
+    """An object that was made before, by its hash; None when it is not cached.
+
+    Args:
+        sha256: of mesh and settings, as ``ObjectAsset.sha256`` says.
+        name: to give it.
+        cache_dir: as for :func:`make_object`.
+    """
+    file = cache_dir / "objects" / f"{sha256}.npz"
+    values = read_cache(file, required=_COMPUTED)
+    if values is None:
+        return None
+    return ObjectAsset(name=name, sha256=sha256, **values)
 
 
 def default_cache_dir() -> Path:

@@ -3,32 +3,50 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import importlib.metadata
 import io
-import multiprocessing
+import json
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
-from functools import partial
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
-from tqdm import tqdm
+from typing import Any, Literal
 
 from flashdex.errors import LibraryError
 from flashdex.hands.spec import load_hand
-from flashdex.motions.demo import HumanDemo
+from flashdex.motions.jobs import Job, Outcome
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.library_writer import LibraryWriter
-from flashdex.motions.objects import ObjectSettings
-from flashdex.motions.process import MotionSettings, Prepared, prepare_motion
+from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from flashdex.motions.motion_cache import content_hash
+from flashdex.motions.objects import ObjectSettings, default_cache_dir
+from flashdex.motions.pool import run_jobs
+from flashdex.motions.process import MotionSettings
+from flashdex.motions.recording import Recording, SourceOptions
 from flashdex.motions.residuals import RetargetWeights
-from flashdex.motions.recording import SourceOptions
 from flashdex.motions.sources import list_recordings
 
 PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be prepared, and how.
+
+    Args:
+        source: name of a reader.
+        options: what it is told.
+        settings: of the preparation.
+    """
+
+    source: str
+    options: SourceOptions
+    settings: MotionSettings
+
+    def recordings(self) -> list[Recording]:
+        """The recordings, listed but not read."""
+        return list_recordings(self.source, self.options)
 
 
 def prepare(
@@ -39,8 +57,15 @@ def prepare(
     *,
     control_hz: float = 60.0,
     workers: int = 1,
+    ray: bool = False,
     limit: int | None = None,
     seed: int = 0,
+    mano: Path | None = None,
+    models: Path | None = None,
+    splits: Path | None = None,
+    cut: Literal["auto", "always", "never"] = "auto",
+    speed: float = 1.0,
+    strict: bool = False,
     objects: ObjectSettings | None = None,
     weights: RetargetWeights | None = None,
     cache_dir: Path | None = None,
@@ -48,19 +73,28 @@ def prepare(
 ) -> MotionLibrary:
     """Prepare a collection of recordings as a motion library.
 
+    What was prepared before, with the same content, settings and code, comes from the
+    cache: an interrupted preparation goes on where it was.
+
     Args:
-        source: name of a reader: procedural, keypoints.
-        input: what it reads. keypoints: a folder or a file. procedural: ``quickstart``,
-            ``all``, or kinds separated by commas.
+        source: name of a reader, see ``flashdex.motions.sources.SOURCES``.
+        input: what it reads, mostly the dataset's folder.
         hand: robot hand.
         out: directory of the library; an older library there is replaced at the end.
         control_hz: frames a second of the references.
         workers: processes.
-        limit: at most this many motions.
+        ray: use a Ray cluster in place of processes.
+        limit: at most this many recordings.
         seed: of made-up motions.
+        mano: folder with the MANO models, for sources that need them.
+        models: folder of the object models, where it lies apart from the dataset.
+        splits: file that names each recording's split, where it lies apart.
+        cut: see ``MotionSettings``.
+        speed: of playback; 0.5 makes every motion last twice as long.
+        strict: reject what would be flagged.
         objects: how meshes become objects.
         weights: of the retargeting.
-        cache_dir: of prepared objects.
+        cache_dir: of prepared objects and motions.
         progress: show a bar; by default when standard error is a terminal.
 
     Returns:
@@ -74,60 +108,132 @@ def prepare(
         >>> library.num_motions  # doctest: +SKIP
         4
     """
-    load_hand(hand)  # refuses an unknown name before anything is read
-    options = SourceOptions(path=input, seed=seed, limit=limit)
-    demos = [d for r in list_recordings(source, options) for d in r.read()]
+    options = SourceOptions(
+        path=None if input is None else Path(input),
+        mano=mano,
+        models=models,
+        splits=splits,
+        seed=seed,
+        limit=limit,
+    )
     settings = MotionSettings(
         hand=hand,
         control_hz=control_hz,
         objects=objects or ObjectSettings(),
         weights=weights or RetargetWeights(),
+        cut=cut,
+        speed=speed,
+        strict=strict,
         cache_dir=cache_dir,
     )
-    hidden = None if progress is None else not progress
-    bar = tqdm(
-        _run(demos, settings, workers), total=len(demos), disable=hidden, unit="motion"
-    )
-    prepared = list(bar)
-    manifest = {
-        "source": source,
-        "seed": seed,
-        "settings": {
-            "objects": asdict(settings.objects),
-            "weights": asdict(settings.weights),
-        },
+    order = Order(source, options, settings)
+    return run_order(order, out, workers=workers, ray=ray, progress=progress)
+
+
+def run_order(
+    order: Order,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    ray: bool = False,
+    progress: bool | None = None,
+) -> MotionLibrary:
+    """Prepare what an order names; see :func:`prepare`.
+
+    Args:
+        order: recordings and settings.
+        out: directory of the library.
+        workers: processes.
+        ray: use a Ray cluster in place of processes.
+        progress: show a bar.
+    """
+    settings = order.settings
+    load_hand(settings.hand)  # refuses an unknown name before anything is read
+    recordings, doubles = _without_doubles(order.recordings())
+    jobs = [Job(recording, settings) for recording in recordings]
+    outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
+    rows = [row for outcome in outcomes for row in outcome.rows] + doubles
+    manifest = _facts(order, rows)
+    hand, fps = settings.hand, settings.control_hz
+    writer = LibraryWriter(out, hand=hand, fps=fps, manifest=manifest)
+    for record in _records(outcomes, settings.cache_dir or default_cache_dir()):
+        writer.add(record)
+    _refuse_empty(rows, out)
+    return MotionLibrary.load(writer.write(report=make_report(rows)))
+
+
+def hash_inputs(order: Order) -> str:
+    """SHA-256 of the recordings' content and the settings, not of the code.
+
+    Args:
+        order: recordings and settings.
+    """
+    digest = hashlib.sha256(_settings_text(order.settings).encode())
+    for recording in order.recordings():
+        digest.update(recording.name.encode())
+        with suppress(OSError):  # a file that cannot be read has no content
+            digest.update(content_hash(recording).encode())
+    return digest.hexdigest()
+
+
+def _settings_text(settings: MotionSettings) -> str:
+    chosen = asdict(settings)
+    chosen.pop("cache_dir")
+    return json.dumps(chosen, sort_keys=True)
+
+
+def _without_doubles(
+    recordings: list[Recording],
+) -> tuple[list[Recording], list[dict[str, Any]]]:
+    """Recordings whose content comes once, and report rows of the others."""
+    kept: dict[str, Recording] = {}
+    rows = []
+    for recording in recordings:
+        try:
+            key = content_hash(recording) if recording.files else recording.name
+        except OSError:
+            key = recording.name  # its worker says what cannot be read
+        first = kept.setdefault(key, recording)
+        if first is not recording:
+            text = f"I_DUP: the same content as '{first.name}'"
+            rows.append(
+                {"motion": recording.name, "status": "rejected", "reason": text}
+            )
+    return list(kept.values()), rows
+
+
+def _facts(order: Order, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    settings = json.loads(_settings_text(order.settings))
+    return {
+        "source": order.source,
+        "seed": order.options.seed,
+        "settings": settings,
+        "inputs": hash_inputs(order),
         "versions": {p: importlib.metadata.version(p) for p in PACKAGES},
-        "quality": dict(Counter(p.row["status"] for p in prepared)),
+        "quality": dict(Counter(row["status"] for row in rows)),
     }
-    writer = LibraryWriter(out, hand=hand, fps=control_hz, manifest=manifest)
-    for item in prepared:
-        if item.record is not None:
-            writer.add(item.record)
-    _refuse_empty(prepared, out)
-    return MotionLibrary.load(
-        writer.write(report=make_report([p.row for p in prepared]))
-    )
 
 
-def _run(
-    demos: list[HumanDemo], settings: MotionSettings, workers: int
-) -> Iterator[Prepared]:
-    if workers <= 1:
-        yield from (prepare_motion(demo, settings) for demo in demos)
+def _records(outcomes: list[Outcome], root: Path) -> Iterator[MotionRecord]:
+    """Kept motions, one in memory at a time; equal names get a number."""
+    names: Counter[str] = Counter()
+    for outcome in outcomes:
+        for item, row in zip(outcome.load(root), outcome.rows, strict=True):
+            if item.record is None:
+                continue
+            names[item.record.name] += 1
+            if names[item.record.name] > 1:
+                name = f"{item.record.name}_{names[item.record.name]}"
+                item.record, row["motion"] = replace(item.record, name=name), name
+            yield item.record
+
+
+def _refuse_empty(rows: list[dict[str, Any]], out: str | Path) -> None:
+    if any(row["status"] != "rejected" for row in rows):
         return
-    # spawn: a fork of a process that runs torch threads can hang
-    context = multiprocessing.get_context("spawn")
-    single = partial(torch.set_num_threads, 1)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=single) as pool:
-        yield from pool.map(partial(prepare_motion, settings=settings), demos)
-
-
-def _refuse_empty(prepared: list[Prepared], out: str | Path) -> None:
-    if any(p.record is not None for p in prepared):
-        return
-    reasons = [f"  {p.row['motion']}: {p.row['reason']}" for p in prepared[:5]]
+    reasons = [f"  {row['motion']}: {row['reason']}" for row in rows[:5]]
     raise LibraryError(
-        f"{out}: none of {len(prepared)} motions was kept; no library is written.\n"
+        f"{out}: none of {len(rows)} motions was kept; no library is written.\n"
         + "\n".join(reasons)
     )
 

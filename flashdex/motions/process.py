@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from flashdex.errors import DemoError, MeshError
 from flashdex.geometry.rotation import quat_mul, quat_rotate
-from flashdex.hands.spec import load_hand
+from flashdex.hands.spec import HandSpec, load_hand
+from flashdex.keys import Side
 from flashdex.motions.align import AlignedDemo, align
-from flashdex.motions.checks import (
-    Finding,
-    check_aligned,
-    check_demo,
-    check_retarget,
-    status_of,
-)
+from flashdex.motions.attempts import Choice, choose_attempt
+from flashdex.motions.checks import Finding, check_demo, make_strict, status_of
+from flashdex.motions.checks_aligned import check_aligned, check_retarget
 from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.objects import ObjectSettings, make_object
+from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.residuals import RetargetWeights, Targets
 from flashdex.motions.retarget import Retargeter
@@ -46,14 +45,31 @@ class MotionSettings:
         control_hz: frames a second of the references.
         objects: how meshes become objects.
         weights: of the retargeting.
-        cache_dir: of prepared objects; the user's cache by default.
+        attempts: of the inverse kinematics at most; the best one is kept.
+        cut: cut recordings where contact begins and ends: ``auto`` cuts sessions and
+            what lasts too long, ``never`` takes every recording as it is.
+        speed: of playback; 0.5 makes every motion last twice as long.
+        strict: reject what would be flagged.
+        cache_dir: of prepared objects and motions; the user's cache by default.
     """
 
     hand: str = "xhand"
     control_hz: float = 60.0
     objects: ObjectSettings = field(default_factory=ObjectSettings)
     weights: RetargetWeights = field(default_factory=RetargetWeights)
+    attempts: int = 6
+    cut: Literal["auto", "always", "never"] = "auto"
+    speed: float = 1.0
+    strict: bool = False
     cache_dir: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense."""
+        if not self.control_hz > 0 or not self.speed > 0:
+            raise DemoError(
+                f"control rate {self.control_hz:g} and speed {self.speed:g} must be "
+                f"positive (--hz, --speed)."
+            )
 
 
 @dataclass
@@ -64,15 +80,18 @@ class Prepared:
     row: dict[str, Any]
 
 
-def prepare_motion(demo: HumanDemo, settings: MotionSettings) -> Prepared:
+def prepare_motion(
+    demo: HumanDemo, settings: MotionSettings, findings: list[Finding] | None = None
+) -> Prepared:
     """Prepare one motion; a fault of the recording becomes a rejected row.
 
     Args:
         demo: the recording.
         settings: how.
+        findings: remarks from earlier steps.
     """
     row: dict[str, Any] = {"motion": demo.name}
-    findings: list[Finding] = []
+    findings = list(findings or [])
     record = None
     try:
         demo.validate()
@@ -82,12 +101,26 @@ def prepare_motion(demo: HumanDemo, settings: MotionSettings) -> Prepared:
     except (DemoError, MeshError) as error:
         code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
         findings.append(Finding(code, "reject", str(error)))
+    if settings.strict:
+        findings = make_strict(findings)
+    row["source"], row["split"], row["task"] = demo.source, demo.split, demo.task
     row["status"] = status_of(findings)
-    row["reason"] = "; ".join(f"{f.code}: {f.text}" for f in findings)
+    row["reason"] = reason_of(findings)
     if row["status"] == "rejected" or record is None:
         return Prepared(None, row)
     record.info |= {"status": row["status"], "reason": row["reason"]}
     return Prepared(record, row)
+
+
+def reject(name: str, findings: list[Finding]) -> Prepared:
+    """A motion, or a whole recording, that is not prepared at all."""
+    row = {"motion": name, "status": "rejected", "reason": reason_of(findings)}
+    return Prepared(None, row)
+
+
+def reason_of(findings: list[Finding]) -> str:
+    """Findings as the report shows them."""
+    return "; ".join(f"{f.code}: {f.text}" for f in findings)
 
 
 def _prepare(
@@ -98,29 +131,62 @@ def _prepare(
         make_object(m, settings=settings.objects, cache_dir=settings.cache_dir, name=n)
         for m, n in zip(aligned.meshes, aligned.object_names, strict=True)
     ]
-    sdf = make_slot_grid(assets, solid=False)
-    early, figures = check_aligned(aligned, assets, sdf)
+    early, figures = check_aligned(
+        aligned, assets, make_slot_grid(assets, solid=False), up=demo.up
+    )
     findings += early
     row |= figures
     if status_of(findings) == "rejected":
         return None
     specs = load_hand(settings.hand)
-    retargeter = Retargeter(specs, weights=settings.weights)
-    targets = make_targets(aligned, retargeter)
-    result = retargeter.solve(targets, make_slot_grid(assets, solid=True))
-    joint_pos = _park(result.joint_pos, aligned.active)
-    scene = make_reference_scene(specs, [a.parts for a in assets])
-    depth = measure_penetration(scene, joint_pos, aligned.poses, active=aligned.active)
+    choice, targets = _retarget(aligned, assets, specs, settings)
+    best = choice.best
     ranges = np.stack([specs["left"].joint_range, specs["right"].joint_range])
-    late, figures = check_retarget(aligned, joint_pos, result.tip_error, depth, ranges)
+    late, figures = check_retarget(
+        aligned, best.joint_pos, best.tip_error, best.depth, ranges
+    )
     findings += late
     row |= figures
+    return _record(demo, aligned, assets, choice, targets)
+
+
+def _retarget(
+    aligned: AlignedDemo,
+    assets: list[ObjectAsset],
+    specs: Mapping[Side, HandSpec],
+    settings: MotionSettings,
+) -> tuple[Choice, Targets]:
+    retargeter = Retargeter(specs, weights=settings.weights)
+    targets = make_targets(aligned, retargeter)
+    scene = make_reference_scene(specs, [a.parts for a in assets])
+    choice = choose_attempt(
+        retargeter,
+        targets,
+        make_slot_grid(assets, solid=True),
+        count=settings.attempts,
+        active=aligned.active,
+        park=partial(_park, active=aligned.active),
+        measure=partial(
+            measure_penetration, scene, poses=aligned.poses, active=aligned.active
+        ),
+    )
+    return choice, targets
+
+
+def _record(
+    demo: HumanDemo,
+    aligned: AlignedDemo,
+    assets: list[ObjectAsset],
+    choice: Choice,
+    targets: Targets,
+) -> MotionRecord:
     vertices = [np.asarray(m.vertices) for m in aligned.meshes]
     left, right = map(bool, aligned.active)
     left_slot, right_slot = map(int, aligned.hand_object)
+    best = choice.best
     return MotionRecord(
         name=demo.name,
-        frames=make_frames(aligned, joint_pos, targets),
+        frames=make_frames(aligned, best.joint_pos, targets),
         hand_active=(left, right),
         hand_object=(left_slot, right_slot),
         objects=assets,
@@ -128,9 +194,18 @@ def _prepare(
         info={
             "source": demo.source,
             "licence": demo.licence,
+            "split": demo.split,
+            "task": demo.task,
             "source_fps": demo.fps,
             "objects": aligned.object_names,
             "support_z": aligned.support_z,
+            "attempt_scores_m": choice.scores,
+            "provenance": demo.provenance,
+        },
+        quality={
+            "tip_error": best.tip_error.astype(np.float32),
+            "penetration": best.depth.objects.astype(np.float32),
+            "contact": aligned.contact,
         },
     )
 
@@ -148,6 +223,7 @@ def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
     keypoints = torch.tensor(aligned.keypoints)
     arm = quat_rotate(wrist_quat, retargeter.hand.knuckle.expand(*palm.shape[:-1], 3))
     poses = torch.tensor(np.stack(aligned.poses, axis=1))
+    normal = torch.tensor([0.0, 0.0, 1.0], dtype=palm.dtype)
     weight = np.stack([blend(aligned.contact[:, h]) for h in range(2)], axis=1)
     return Targets(
         tips=keypoints[..., [4, 8, 12, 16, 20], :],
@@ -157,10 +233,11 @@ def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
         hand_object=torch.tensor(aligned.hand_object),
         object_pos=poses[..., :3],
         object_quat=poses[..., 3:],
+        palm_normal=quat_rotate(palm[..., 3:], normal.expand(*palm.shape[:-1], 3)),
     )
 
 
-def _park(joint_pos: np.ndarray, active: np.ndarray) -> np.ndarray:
+def _park(joint_pos: np.ndarray, *, active: np.ndarray) -> np.ndarray:
     joint_pos = joint_pos.copy()
     for hand in np.flatnonzero(~active):
         joint_pos[:, hand] = 0.0

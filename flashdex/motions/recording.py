@@ -16,7 +16,7 @@ class SourceOptions:
     Attributes:
         path: folder or file of the dataset.
         mano: folder with ``MANO_LEFT``/``MANO_RIGHT`` (.pkl or .npz).
-        objects: folder of the object models, where it lies apart from the dataset.
+        models: folder of the object models, where it lies apart from the dataset.
         splits: file that names the split of each recording, where it lies apart.
         seed: for sources that make motions up.
         limit: at most this many recordings; a made-up source makes exactly this many.
@@ -24,7 +24,7 @@ class SourceOptions:
 
     path: Path | None = None
     mano: Path | None = None
-    objects: Path | None = None
+    models: Path | None = None
     splits: Path | None = None
     seed: int = 0
     limit: int | None = None

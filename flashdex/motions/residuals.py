@@ -79,6 +79,7 @@ class Targets:
         hand_object: slot of each hand's object, -1 for none, (2,).
         object_pos: m, (T, O, 3).
         object_quat: (T, O, 4).
+        palm_normal: out of the palm, unit, (T, 2, 3).
     """
 
     tips: Tensor
@@ -88,6 +89,7 @@ class Targets:
     hand_object: Tensor
     object_pos: Tensor
     object_quat: Tensor
+    palm_normal: Tensor
 
 
 class Residuals:

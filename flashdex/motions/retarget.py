@@ -28,6 +28,37 @@ from flashdex.motions.wrist import unwrap_wrist
 MAX_STEP = 0.15  # m or rad a joint and iteration
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where the iterations of an attempt begin.
+
+    Args:
+        back: m that the hand is moved back along its palm normal. Then contact counts
+            from the first iteration, so that fingers come to the object from outside
+            and do not end up on its wrong side.
+        curl: share of the fingers' range, 0 straight; None for a relaxed hand.
+        side: m, a further shift in the world.
+    """
+
+    back: float = 0.0
+    curl: float | None = None
+    side: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the hand comes to the object from outside."""
+        return self.back > 0
+
+    def shift(self, palm_normal: Tensor) -> Tensor:
+        """Shift of the wrist, m, (T, 2, 3).
+
+        Args:
+            palm_normal: out of the palm, unit, world, (T, 2, 3).
+        """
+        side = torch.tensor(self.side, dtype=palm_normal.dtype)
+        return side - self.back * palm_normal
+
+
 @dataclass
 class RetargetResult:
     """A joint reference.
@@ -62,25 +93,32 @@ class Retargeter:
         self._jacobian = HandJacobian(specs)
 
     @torch.no_grad()
-    def solve(self, targets: Targets, sdf: SdfGrid) -> RetargetResult:
+    def solve(
+        self, targets: Targets, sdf: SdfGrid, *, start: Start | None = None
+    ) -> RetargetResult:
         """Joint references of all frames of a motion; both hands at once.
 
         Args:
             targets: what the human hands and the objects do.
             sdf: distance grids of the objects, row = slot, float64.
+            start: where the iterations begin; free of contact by default.
         """
+        start = start or Start()
         residuals = Residuals(self.hand, targets, sdf, self.weights)
         free, held = self.weights.free_iterations, self.weights.contact_iterations
-        q = self._initial(targets)
+        q = self._initial(targets, start)
         for step in range(free + held):
-            q = self._iterate(q, residuals, contact=step >= free)
+            q = self._iterate(q, residuals, contact=start.is_outside or step >= free)
         error = (self._kinematics(q)["tip_pos"] - targets.tips).norm(dim=-1)
         return RetargetResult(q.numpy(), error.numpy())
 
-    def _initial(self, targets: Targets) -> Tensor:
-        """Wrist as the human palm wants it, fingers relaxed."""
+    def _initial(self, targets: Targets, start: Start) -> Tensor:
+        """Wrist as the human palm wants it, moved back; fingers relaxed or curled."""
         q = self.hand.relaxed.repeat(len(targets.tips), 1, 1)
-        q[..., :3] = targets.wrist_pos
+        if start.curl is not None:
+            low, high = self.hand.low[:, 6:], self.hand.high[:, 6:]
+            q[..., 6:] = low + start.curl * (high - low)
+        q[..., :3] = targets.wrist_pos + start.shift(targets.palm_normal)
         for hand in range(2):
             quats = targets.wrist_quat[:, hand].numpy()
             q[:, hand, 3:6] = torch.tensor(unwrap_wrist(quats))

@@ -25,16 +25,37 @@ def _default_terminations() -> dict[str, dict[str, Any] | None]:
     return default_mapping("terminations")
 
 
+SourceName = Literal[
+    "procedural",
+    "keypoints",
+    "myodm",
+    "taco",
+    "oakink2",
+    "hot3d",
+    "arctic",
+    "grab",
+    "spider",
+    "fdr",
+]
+"""Readers of recordings; `flashdex.motions.sources.SOURCES` has the same names."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MotionsConfig:
     """Which motions are trained on: a prepared library, or a source to prepare."""
 
     library: str | None = None
     """Folder of a prepared library; when given, nothing is prepared."""
-    source: Literal["procedural", "keypoints"] | None = None
-    """Reader that makes the human demos when no library is given."""
+    source: SourceName | None = None
+    """Reader of the recordings, which are prepared when no library is given."""
     input: str | None = None
-    """Folder or file the reader reads (keypoints); procedural needs none."""
+    """Folder or file the reader reads; procedural and myodm need none."""
+    mano: str | None = None
+    """Folder with MANO_LEFT and MANO_RIGHT, for sources that need the hand model."""
+    models: str | None = None
+    """Folder of the object models, where it lies apart from the recordings."""
+    speed: float = number(1.0, above=0)
+    """Playback speed of the recordings; 0.5 makes a motion last twice as long."""
     select: list[str] | None = None
     """Names or globs of the motions to keep; null keeps all."""
     count: int | None = number(None, low=1)

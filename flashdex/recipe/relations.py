@@ -37,8 +37,12 @@ def _motions(recipe: Recipe) -> list[str]:
             "motions: neither library nor source is given; set motions.library to a "
             "prepared folder or motions.source to procedural"
         ]
-    if motions.source == "keypoints" and not (motions.input or motions.library):
-        return ["motions.input: missing; the source 'keypoints' reads a folder"]
+    if motions.library is not None:
+        return []
+    if motions.source not in ("procedural", "myodm") and motions.input is None:
+        return [
+            f"motions.input: missing; the source '{motions.source}' reads a folder"
+        ]
     return []
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.files import write_atomic
-from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.trivial import frozen_object
 from flashdex.training.attempts import grace_steps
 from flashdex.training.rollouts import roll_all
@@ -110,3 +110,23 @@ def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
             "errors": {k: round(v, 5) for k, v in verdict.values.items()},
         }
     return out
+
+
+def format_baselines(baselines: Baselines) -> str:
+    """A table: how many motions each baseline passes, by criterion.
+
+    Args:
+        baselines: from ``score_baselines``.
+    """
+    names = list(baselines.rows)
+    total = len(next(iter(baselines.rows.values())))
+    lines = [f"{'criterion':<24}" + "".join(f"{n:>20}" for n in names)]
+    for criterion in criterion_names():
+        if criterion.endswith(("_left", "_right")):
+            continue
+        counts = [
+            sum(criterion in row["passed"] for row in baselines.rows[n].values())
+            for n in names
+        ]
+        lines.append(f"{criterion:<24}" + "".join(f"{c:>20}" for c in counts))
+    return "\n".join([*lines, f"passed of {total} motions"])

@@ -24,7 +24,9 @@ from flashdex.errors import FlashdexError, LibraryError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.prepare import prepare
+from flashdex.motions.prepare import Order, hash_inputs, run_order
+from flashdex.motions.process import MotionSettings
+from flashdex.motions.recording import SourceOptions
 from flashdex.recipe import Recipe
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner
@@ -155,18 +157,32 @@ def _load_library(recipe: Recipe) -> MotionLibrary:
             "of a prepared library, or motions.source=procedural."
         )
     folder = Path("libraries") / _library_name(recipe)
-    if not (folder / "manifest.json").is_file():
-        _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
-        prepare(
-            source=motions.source,
-            input=motions.input,
-            hand=recipe.hand,
-            out=folder,
-            control_hz=motions.control_hz,
-            limit=motions.count,
-            seed=motions.seed,
-        )
-    return MotionLibrary.load(folder)
+    order = _order(recipe)
+    if (folder / "manifest.json").is_file():
+        library = MotionLibrary.load(folder)
+        if library.manifest.get("inputs") == hash_inputs(order):
+            return library
+        _LOG.info("the recordings have changed since %s was prepared", folder)
+    _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
+    return run_order(order, folder)
+
+
+def _order(recipe: Recipe) -> Order:
+    motions = recipe.motions
+    assert motions.source is not None
+    # made-up motions are made by number; of recorded ones, the selection is counted
+    counted = motions.source == "procedural" or motions.select is None
+    options = SourceOptions(
+        path=None if motions.input is None else Path(motions.input),
+        mano=None if motions.mano is None else Path(motions.mano),
+        models=None if motions.models is None else Path(motions.models),
+        seed=motions.seed,
+        limit=motions.count if counted else None,
+    )
+    settings = MotionSettings(
+        hand=recipe.hand, control_hz=motions.control_hz, speed=motions.speed
+    )
+    return Order(motions.source, options, settings)
 
 
 def _library_name(recipe: Recipe) -> str:
@@ -182,8 +198,7 @@ def _library_name(recipe: Recipe) -> str:
 def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
     """Keep the motions named by ``motions.select`` and ``motions.count``.
 
-    Frames are not copied: the rows of ``motions`` are chosen, their frames stay where
-    they are on the frame axis.
+    Their frames are copied into memory, one motion after the other.
     """
     chosen = list(range(library.num_motions))
     if recipe.motions.select is not None:

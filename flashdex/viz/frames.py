@@ -35,6 +35,18 @@ def dress_model(rollout: Rollout) -> mujoco.MjModel:
         rollout: stored rollout; its own model stays as it is.
     """
     spec = mujoco.MjSpec.from_string(rollout.model_xml)
+    dress_scene(spec, width=WIDTH, height=HEIGHT)
+    return spec.compile()
+
+
+def dress_scene(spec: mujoco.MjSpec, *, width: int, height: int) -> None:
+    """Add the light and the pale sky of all pictures to a scene.
+
+    Args:
+        spec: scene under construction.
+        width: of the largest picture, pixels.
+        height: likewise.
+    """
     spec.add_texture(
         name="film_sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -55,11 +67,10 @@ def dress_model(rollout: Rollout) -> mujoco.MjModel:
     view.headlight.ambient = [0.45] * 3
     view.headlight.diffuse = [0.4] * 3
     view.quality.shadowsize = 2048  # software rendering pays for every pixel
-    view.global_.offwidth, view.global_.offheight = WIDTH, HEIGHT
+    view.global_.offwidth, view.global_.offheight = width, height
     # The picture spans objects of centimetres, whatever far-away bodies the scene has.
     spec.stat.extent = 1.0
     view.map.znear, view.map.zfar = 0.02, 30.0
-    return spec.compile()
 
 
 def frame_camera(

@@ -4,10 +4,29 @@ from __future__ import annotations
 
 from flashdex.errors import DemoError, UnknownSourceError
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources.arctic import ARCTIC
+from flashdex.motions.sources.fdr import FDR
+from flashdex.motions.sources.grab import GRAB
+from flashdex.motions.sources.hot3d import HOT3D
 from flashdex.motions.sources.keypoints import KEYPOINTS
+from flashdex.motions.sources.myodm import MYODM
+from flashdex.motions.sources.oakink2 import OAKINK2
 from flashdex.motions.sources.procedural import PROCEDURAL
+from flashdex.motions.sources.spider import SPIDER
+from flashdex.motions.sources.taco import TACO
 
-SOURCES: dict[str, Source] = {"keypoints": KEYPOINTS, "procedural": PROCEDURAL}
+SOURCES: dict[str, Source] = {
+    "procedural": PROCEDURAL,
+    "keypoints": KEYPOINTS,
+    "myodm": MYODM,
+    "taco": TACO,
+    "oakink2": OAKINK2,
+    "hot3d": HOT3D,
+    "arctic": ARCTIC,
+    "grab": GRAB,
+    "spider": SPIDER,
+    "fdr": FDR,
+}
 
 
 def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
@@ -32,3 +51,10 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     if not recordings:
         raise DemoError(f"{source}: no recordings in {options.path}.")
     return recordings if options.limit is None else recordings[: options.limit]
+
+
+def format_sources() -> str:
+    """One line a source: its name and what it reads."""
+    width = max(map(len, SOURCES))
+    lines = [f"  {name:<{width}}  {s.about}" for name, s in SOURCES.items()]
+    return "\n".join(["recordings (flashdex prepare --source NAME):", *lines])

@@ -1,0 +1,200 @@
+"""Who touches what and when, over a whole session, and what moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.ndimage import uniform_filter1d
+
+from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
+from flashdex.motions.demo import HumanDemo
+from flashdex.motions.gaps import missing_frames
+from flashdex.motions.meshes import reduce_mesh
+from flashdex.motions.signed_distance import surface_distance
+from flashdex.motions.support import STILL_SPEED, STILL_TURN, runs
+from flashdex.motions.tracks import angular_velocity, linear_velocity, rotation
+
+TOUCH, LEAVE = 0.02, 0.03  # m: a touch begins below the first, ends above the second
+BRIDGE_SECONDS = 0.5  # shorter interruptions are none
+TOUCH_SECONDS = 0.3  # a shorter touch is none
+MOVE_TRAVEL, MOVE_TURN = 0.02, np.deg2rad(15)  # less is no motion
+MESH_FACES = 5000  # enough for a threshold of centimetres
+SAMPLE_STEP = 0.005  # m
+
+
+@dataclass(frozen=True)
+class Activity:
+    """A session frame by frame.
+
+    Args:
+        sides: hands, in the order of the axis H.
+        touch: hand touches object, (H, O, T) bool.
+        held: object that a hand is busy with, -1 for none, (H, T).
+        moving: object moves and gets somewhere, (O, T) bool.
+        pace: speed of each object, m/s, 0 where unknown, (O, T).
+        hand_seen: (H, T) bool.
+        object_seen: (O, T) bool.
+    """
+
+    sides: list[Side]
+    touch: np.ndarray
+    held: np.ndarray
+    moving: np.ndarray
+    pace: np.ndarray
+    hand_seen: np.ndarray
+    object_seen: np.ndarray
+
+
+def find_activity(demo: HumanDemo, meshes: list[trimesh.Trimesh]) -> Activity:
+    """Contact and motion of a session; nothing is touched where a track is missing.
+
+    Args:
+        demo: with NaN where a hand or an object was not tracked.
+        meshes: of its objects, m.
+    """
+    sides: list[Side] = [s for s in SIDES if s in demo.keypoints]
+    points = [demo.keypoints[s] for s in sides]
+    near = np.stack(
+        [
+            nearest_tips(points, body.pose, mesh)
+            for body, mesh in zip(demo.objects, meshes, strict=True)
+        ],
+        axis=1,
+    )
+    touch = np.stack([[touches(row) for row in hand] for hand in near])
+    held = np.stack(
+        [busy_with(n, t, demo.fps) for n, t in zip(near, touch, strict=True)]
+    )
+    speeds = [speeds_of(b.pose, demo.fps) for b in demo.objects]
+    moving = [moves(b.pose, s) for b, s in zip(demo.objects, speeds, strict=True)]
+    return Activity(
+        sides=sides,
+        touch=touch,
+        held=held,
+        moving=np.stack(moving),
+        pace=np.stack([np.nan_to_num(s[:, 0]) for s in speeds]),
+        hand_seen=np.stack([~missing_frames(p) for p in points]),
+        object_seen=np.stack([~missing_frames(b.pose) for b in demo.objects]),
+    )
+
+
+def nearest_tips(
+    hands: list[np.ndarray], pose: np.ndarray, mesh: trimesh.Trimesh
+) -> np.ndarray:
+    """Distance of each hand's nearest fingertip to an object.
+
+    Only tips within 3 cm of the bounding box are measured; the rest is infinitely far.
+
+    Args:
+        hands: keypoints of each, m, (T, 21, 3), NaN where not tracked.
+        pose: of the object, (T, 7), NaN where not tracked.
+        mesh: of the object, m.
+
+    Returns:
+        m, (H, T).
+    """
+    near = np.full((len(hands), len(pose)), np.inf)
+    tips = np.stack([k[:, TIP_KEYPOINTS] for k in hands])
+    seen = ~missing_frames(pose)
+    if not seen.any():
+        return near
+    local = np.full_like(tips, np.nan)
+    turn = rotation(pose[seen, 3:]).as_matrix()
+    offset = tips[:, seen] - pose[None, seen, None, :3]
+    local[:, seen] = np.einsum("tji,htkj->htki", turn, offset)
+    low, high = mesh.bounds
+    outside = np.linalg.norm(np.maximum(low - local, local - high).clip(0), axis=-1)
+    hand, frame, finger = np.nonzero(outside < LEAVE)  # NaN compares as False
+    if len(hand):
+        points = local[hand, frame, finger]
+        coarse = reduce_mesh(mesh, max_faces=MESH_FACES)
+        gaps = surface_distance(coarse, points, step=SAMPLE_STEP)
+        np.minimum.at(near, (hand, frame), gaps)
+    return near
+
+
+def touches(near: np.ndarray) -> np.ndarray:
+    """Touch with hysteresis, (T,) bool: begins below 2 cm, ends above 3 cm.
+
+    Args:
+        near: distance, m, (T,).
+    """
+    mask = np.zeros(len(near), dtype=bool)
+    for start, end in runs(near < LEAVE):
+        mask[start:end] = near[start:end].min() < TOUCH
+    return mask
+
+
+def busy_with(near: np.ndarray, touch: np.ndarray, fps: float) -> np.ndarray:
+    """The object that one hand is busy with: the nearest of those it touches.
+
+    Distances are averaged over 0.5 s, so that a finger that strays to a neighbour does
+    not count; a touch of less than 0.3 s is none, or part of the touch beside it.
+
+    Args:
+        near: distance to each object, m, (O, T).
+        touch: (O, T) bool.
+        fps: frames a second.
+
+    Returns:
+        Object, -1 for none, (T,).
+    """
+    size = max(round(BRIDGE_SECONDS * fps), 1)
+    near = np.where(touch, near, LEAVE)
+    mean = uniform_filter1d(near, size, axis=1, mode="nearest")
+    busy = bridge(np.asarray(touch.any(axis=0)), fps)
+    held = np.where(busy, mean.argmin(axis=0), -1)
+    edges = np.flatnonzero(np.diff(held)) + 1
+    spans = np.split(np.arange(len(held)), edges)
+    for span in spans:
+        if held[span[0]] >= 0 and len(span) < TOUCH_SECONDS * fps:
+            before = held[span[0] - 1] if span[0] else -1
+            after = held[span[-1] + 1] if span[-1] + 1 < len(held) else -1
+            held[span] = before if before >= 0 else after
+    return held
+
+
+def bridge(mask: np.ndarray, fps: float) -> np.ndarray:
+    """A mask (T,) whose interruptions of less than 0.5 s are closed."""
+    mask = mask.copy()
+    for start, end in runs(~mask):
+        if start > 0 and end < len(mask) and end - start < BRIDGE_SECONDS * fps:
+            mask[start:end] = True
+    return mask
+
+
+def speeds_of(pose: np.ndarray, fps: float) -> np.ndarray:
+    """Linear (m/s) and angular speed (rad/s), NaN where not tracked, (T, 2)."""
+    speeds = np.full((len(pose), 2), np.nan)
+    for a, b in runs(~missing_frames(pose), least=3):
+        straight = linear_velocity(pose[a:b, :3], fps, sigma=1.0)
+        turning = angular_velocity(pose[a:b, 3:], fps, sigma=1.0)
+        speeds[a:b, 0] = np.linalg.norm(straight, axis=-1)
+        speeds[a:b, 1] = np.linalg.norm(turning, axis=-1)
+    return speeds
+
+
+def moves(pose: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Frames of motions that get somewhere (2 cm or 15 degrees); jitter does not.
+
+    Args:
+        pose: (T, 7), NaN where not tracked.
+        speeds: of ``speeds_of``, (T, 2).
+    """
+    mask = np.zeros(len(pose), dtype=bool)
+    for a, b in runs((speeds[:, 0] > STILL_SPEED) | (speeds[:, 1] > STILL_TURN)):
+        travel, turn = motion_of(pose[a:b])
+        mask[a:b] = travel > MOVE_TRAVEL or turn > MOVE_TURN
+    return mask
+
+
+def motion_of(pose: np.ndarray) -> tuple[float, float]:
+    """Largest travel (m) and turn (rad) from the first tracked frame of (T, 7)."""
+    pose = pose[~missing_frames(pose)]
+    if not len(pose):
+        return 0.0, 0.0
+    turn = rotation(pose[:, 3:])
+    travel = np.linalg.norm(pose[:, :3] - pose[0, :3], axis=-1).max()
+    return float(travel), float((turn * turn[0].inv()).magnitude().max())

@@ -1,0 +1,132 @@
+"""Downloads the recordings that anybody may have without a registration.
+
+MyoDM: 95 recorded clips of one right hand and one object, inside the wheel of
+``myosuite`` 2.12.2. pip fetches the wheel without its dependencies; its hash is checked
+before anything is taken out of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+from flashdex.errors import DemoError, UnknownNameError
+from flashdex.motions.objects import default_cache_dir
+
+WHEEL = "myosuite==2.12.2"
+WHEEL_SHA256 = "bec0133d9d4ba0249aeccdd7de632eead4749436ffb4e5a3c44a8f9cedafd9ea"
+CLIP = re.compile(r"myosuite/envs/myo/myodm/data/MyoHand_(([a-z]+)_\w+)\.npz")
+OBJECTS = "myosuite/simhive/object_sim"
+HAND = "myosuite/simhive/myo_sim/hand/assets/myohand_body.xml"
+LICENCES = {
+    "LICENSE": "myosuite-2.12.2.dist-info/licenses/LICENSE",
+    "LICENSE.hand": "myosuite/simhive/myo_sim/LICENSE",
+    "LICENSE.objects": "myosuite/simhive/object_sim/LICENSE",
+}
+NOTE = (
+    "MyoDM: software, hand model and meshes are Apache-2.0 (licences beside the clips). "
+    "The motions are kinematic fits to mocap of GRAB; the authors ask users to respect "
+    "GRAB's licence: non-commercial research, no redistribution of the data."
+)
+
+
+class UnknownDatasetError(UnknownNameError):
+    """A dataset that cannot be fetched."""
+
+    kind = "dataset that can be fetched"
+
+
+def myodm_dir() -> Path:
+    """Where ``fetch myodm`` puts the recordings by default."""
+    return default_cache_dir() / "data" / "myodm"
+
+
+def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> Path:
+    """Fetch a dataset; what is already complete is not fetched again.
+
+    Args:
+        name: myodm.
+        out: folder; ``<cache>/data/<name>`` by default.
+        wheel: the package file, where it was downloaded by other means.
+
+    Returns:
+        The folder, complete.
+
+    Raises:
+        UnknownDatasetError: names the known ones.
+        DemoError: pip failed, the file is another one, or the disk refused.
+    """
+    if name != "myodm":
+        raise UnknownDatasetError(name, ["myodm"])
+    out = out or myodm_dir()
+    if _is_complete(out):
+        return out
+    if out.exists() and any(out.iterdir()):
+        raise DemoError(f"{out} holds other files; give an empty folder with --out.")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".fetch-") as scratch:
+            work = Path(scratch)
+            _unpack(_check(wheel or _download(work)), work / "data")
+            if out.exists():
+                out.rmdir()
+            (work / "data").rename(out)
+    except OSError as error:
+        raise DemoError(f"{out}: cannot be written ({error}).") from error
+    return out
+
+
+def _is_complete(folder: Path) -> bool:
+    try:
+        stored = json.loads((folder / "source.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    files = [folder / name for name in stored.get("files", [])]
+    return stored.get("sha256") == WHEEL_SHA256 and all(f.is_file() for f in files)
+
+
+def _download(folder: Path) -> Path:
+    command = [sys.executable, "-m", "pip", "download", "--no-deps", "--quiet"]
+    command += ["--disable-pip-version-check", "--dest", str(folder), WHEEL]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = list(folder.glob("*.whl"))
+    if done.returncode or len(found) != 1:
+        told = (done.stderr or done.stdout).strip().splitlines()
+        raise DemoError(
+            f"pip could not download {WHEEL}: {told[-1] if told else 'no message'}. "
+            f"Download the wheel elsewhere and give it with --wheel FILE."
+        )
+    return found[0]
+
+
+def _check(wheel: Path) -> Path:
+    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    if digest != WHEEL_SHA256:
+        raise DemoError(
+            f"{wheel}: sha256 {digest[:16]}..., expected {WHEEL_SHA256[:16]}...: not "
+            f"the wheel of {WHEEL}, or damaged. Nothing was taken from it."
+        )
+    return wheel
+
+
+def _unpack(wheel: Path, out: Path) -> None:
+    """Clips, their objects' meshes, the hand's tree and the licences."""
+    with zipfile.ZipFile(wheel) as archive:
+        clips = {m[0]: m for m in map(CLIP.fullmatch, archive.namelist()) if m}
+        wanted = {f"clips/{m[1]}.npz": name for name, m in clips.items()}
+        names = sorted({m[2] for m in clips.values()})
+        wanted |= {f"meshes/{n}.stl": f"{OBJECTS}/{n}/{n}.stl" for n in names}
+        wanted |= {"myohand_body.xml": HAND, **LICENCES}
+        for target, member in wanted.items():
+            (out / target).parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(member) as source, (out / target).open("wb") as file:
+                shutil.copyfileobj(source, file)
+    stored = {"source": WHEEL, "sha256": WHEEL_SHA256, "files": sorted(wanted)}
+    (out / "source.json").write_text(json.dumps(stored, indent=1), encoding="utf-8")

@@ -1,0 +1,131 @@
+"""One recording after another: read, repair, cut, prepare; nothing raises.
+
+This is what a worker process does. Whatever is wrong with a recording becomes a
+rejected row of the report, so that one bad file never costs the others.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flashdex.errors import DemoError, MeshError
+from flashdex.motions.checks import MAX_SECONDS, Finding
+from flashdex.motions.demo import HumanDemo
+from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
+from flashdex.motions.objects import default_cache_dir
+from flashdex.motions.process import MotionSettings, Prepared, prepare_motion, reject
+from flashdex.motions.recording import Recording
+from flashdex.motions.repair import repair
+from flashdex.motions.segment import segment
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker is given: a recording and how to prepare it."""
+
+    recording: Recording
+    settings: MotionSettings
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker gives back; the motions stay on the disk where that is possible.
+
+    Attributes:
+        rows: of the report, one a motion.
+        file: that keeps the motions, if they could be kept.
+        prepared: the motions themselves, if not.
+    """
+
+    rows: list[dict[str, Any]]
+    file: Path | None
+    prepared: list[Prepared]
+
+    def load(self, root: Path) -> list[Prepared]:
+        """The motions.
+
+        Args:
+            root: of the cache.
+        """
+        stored = None if self.file is None else read_prepared(self.file, root)
+        return self.prepared if stored is None else stored
+
+
+def run_job(job: Job) -> Outcome:
+    """Prepare one recording, or find it prepared; never raises for its content."""
+    root = job.settings.cache_dir or default_cache_dir()
+    try:
+        file = cache_file(job.recording, job.settings, root)
+    except OSError as error:
+        rejected = _reject(job.recording.name, "E_FILE", f"cannot be read: {error}")
+        return Outcome([rejected.row], None, [rejected])
+    prepared = read_prepared(file, root)
+    if prepared is None:
+        prepared = prepare_recording(job.recording, job.settings)
+        write_prepared(file, prepared)
+    rows = [item.row for item in prepared]
+    # a disk that refuses the cache must not cost the motions
+    return Outcome(rows, file, [] if file.is_file() else prepared)
+
+
+def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
+    """All motions of a recording, rejected ones too.
+
+    Args:
+        recording: listed by a source.
+        settings: how.
+    """
+    try:
+        demos = recording.read()
+        return [item for demo in demos for item in prepare_demo(demo, settings)]
+    except (DemoError, MeshError) as error:
+        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
+        return [_reject(recording.name, code, str(error))]
+    except Exception as error:  # what no check foresaw must not end the others
+        logger.debug("%s", recording.name, exc_info=True)
+        text = f"not readable: {type(error).__name__}: {error}"
+        return [_reject(recording.name, "E_READ", text)]
+
+
+def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
+    """Repair a demonstration, cut it if it is to be cut, prepare every piece.
+
+    Args:
+        demo: as read.
+        settings: how.
+    """
+    demo = _paced(demo, settings.speed)
+    demo.validate(complete=False)
+    pieces, findings = repair(demo)
+    done: list[Prepared] = []
+    for piece in pieces:
+        parts, remarks = [piece], list[Finding]()
+        if _is_cut(piece, settings):
+            parts, remarks = segment(piece)
+        if not parts:
+            done.append(reject(piece.name, findings + remarks))
+        done += [prepare_motion(p, settings, findings + remarks) for p in parts]
+    return done or [reject(demo.name, findings)]
+
+
+def _paced(demo: HumanDemo, speed: float) -> HumanDemo:
+    if speed == 1.0:
+        return demo
+    told = demo.provenance | {"speed": speed}
+    return replace(demo, fps=demo.fps * speed, provenance=told)
+
+
+def _is_cut(demo: HumanDemo, settings: MotionSettings) -> bool:
+    if settings.cut == "never":
+        return False
+    long = demo.seconds > MAX_SECONDS
+    return demo.needs_cutting or long or settings.cut == "always"
+
+
+def _reject(name: str, code: str, text: str) -> Prepared:
+    return reject(name, [Finding(code, "reject", text)])

@@ -1,0 +1,93 @@
+"""Jumps: steps between neighbouring frames that no hand and no object can make."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flashdex.motions.tracks import rotation
+
+JUMP_SPEED, JUMP_TURN, JUMP_STEP = 5.0, 30.0, 0.03  # m/s, rad/s, m
+JUMP_RATIO = 6.0  # of the usual step around a frame
+USUAL = 7  # steps before and after that tell the usual one
+LONGEST = 2  # frames of an outlier that is repaired
+
+
+def jump_steps(pose: np.ndarray, fps: float) -> np.ndarray:
+    """Steps that are jumps: faster than 5 m/s or 30 rad/s, or 6 times the usual step.
+
+    Args:
+        pose: (T, 7), NaN where not tracked: a step from or to there is none.
+        fps: frames a second.
+
+    Returns:
+        Whether the track jumps from frame t to t + 1, (T - 1,) bool.
+    """
+    step, turn = _steps(pose, 1)
+    return _impossible(step, turn, _usual(step), fps)
+
+
+def outliers(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
+    """Runs of one or two frames (start, end excluded) off the track: there and back.
+
+    Where the frames before and after a run fit each other, the run is at fault. Longer
+    runs, and jumps without a way back, are left alone: nobody knows which side is true.
+
+    Args:
+        pose: (T, 7), NaN where not tracked.
+        fps: frames a second.
+    """
+    step, turn = _steps(pose, 1)
+    usual = _usual(step)
+    jumps = _impossible(step, turn, usual, fps)
+    # bridges[k]: the way from t to t + k + 1, a step at a time
+    bridges = {}
+    for k in range(1, LONGEST + 1):
+        far, twist = (way / (k + 1) for way in _steps(pose, k + 1))
+        fits = np.isfinite(far)
+        fits &= ~_impossible(far, twist, usual[: len(far)], fps)
+        bridges[k] = fits
+    found: list[tuple[int, int]] = []
+    for start in np.flatnonzero(jumps) + 1:
+        if found and found[-1][1] >= start:
+            continue  # the frame before is an outlier itself
+        for k in range(1, LONGEST + 1):
+            end = start + k
+            if end < len(pose) and jumps[end - 1] and bridges[k][start - 1]:
+                found.append((int(start), int(end)))
+                break
+    return found
+
+
+def _steps(pose: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (m) and angle (rad) from each frame to the one ``stride`` later."""
+    before, after = pose[:-stride], pose[stride:]
+    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    step, turn = np.full(len(before), np.nan), np.full(len(before), np.nan)
+    if known.any():
+        before, after = before[known], after[known]
+        step[known] = np.linalg.norm(after[:, :3] - before[:, :3], axis=-1)
+        turn[known] = (
+            rotation(after[:, 3:]) * rotation(before[:, 3:]).inv()
+        ).magnitude()
+    return step, turn
+
+
+def _usual(step: np.ndarray) -> np.ndarray:
+    """Running median of the steps, without those that are unknown."""
+    if not len(step):
+        return step
+    padded = np.pad(step, USUAL, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * USUAL + 1)
+    ordered = np.sort(windows, axis=1)  # NaN last
+    count = np.isfinite(windows).sum(axis=1)
+    row = np.arange(len(step))
+    low = ordered[row, np.maximum(count - 1, 0) // 2]
+    return (low + ordered[row, count // 2]) / 2
+
+
+def _impossible(
+    step: np.ndarray, turn: np.ndarray, usual: np.ndarray, fps: float
+) -> np.ndarray:
+    """Comparisons with NaN are False: an unknown step is no jump."""
+    bad = (step * fps > JUMP_SPEED) | (turn * fps > JUMP_TURN)
+    return bad | ((step > JUMP_RATIO * usual) & (step > JUMP_STEP))

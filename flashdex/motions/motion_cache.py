@@ -1,0 +1,152 @@
+"""Prepared recordings on the disk: what is done is not done again.
+
+A file a recording, named by the hash of everything its result depends on: content of
+its files, settings, and the code that prepares. An interrupted preparation goes on
+where it was, and one new recording costs one recording.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import flashdex
+from flashdex.files import hash_file, open_atomic
+from flashdex.motions.library_writer import MotionRecord
+from flashdex.motions.object_cache import DAMAGED
+from flashdex.motions.objects import read_object
+from flashdex.motions.process import MotionSettings, Prepared
+from flashdex.motions.recording import Recording
+
+logger = logging.getLogger(__name__)
+
+CODE = ("motions", "hands", "geometry")  # parts of the package that decide the result
+LIBRARIES = ("numpy", "scipy", "torch", "mujoco", "trimesh", "coacd")
+
+
+def content_hash(recording: Recording) -> str:
+    """SHA-256 of what a recording is made of: its files' content and its key."""
+    digest = hashlib.sha256(recording.key.encode())
+    for file in recording.files:
+        digest.update(hash_file(file).encode())
+    return digest.hexdigest()
+
+
+def cache_file(recording: Recording, settings: MotionSettings, root: Path) -> Path:
+    """Where the result of a recording is kept.
+
+    Args:
+        recording: listed.
+        settings: that it is prepared with.
+        root: of the cache.
+
+    Raises:
+        OSError: a file of the recording cannot be read.
+    """
+    chosen = asdict(settings)
+    chosen.pop("cache_dir")
+    facts = [recording.name, content_hash(recording), chosen, _code_hash()]
+    text = json.dumps(facts, sort_keys=True, default=str)
+    return root / "motions" / f"{hashlib.sha256(text.encode()).hexdigest()}.npz"
+
+
+@cache
+def _code_hash() -> str:
+    """Of the code and the libraries that prepare: a changed line is another result."""
+    root = Path(flashdex.__file__).parent
+    digest = hashlib.sha256()
+    for part in CODE:
+        for file in sorted((root / part).rglob("*.py")):
+            digest.update(file.read_bytes())
+    digest.update(" ".join(version(name) for name in LIBRARIES).encode())
+    return digest.hexdigest()
+
+
+def write_prepared(file: Path, prepared: list[Prepared]) -> None:
+    """Keep the outcome of a recording; a failure is logged and not fatal.
+
+    Args:
+        file: from ``cache_file``.
+        prepared: all motions of the recording, rejected ones too.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    entries = []
+    for i, item in enumerate(prepared):
+        entries.append({"row": item.row, "record": None})
+        if item.record is None:
+            continue
+        record = item.record
+        for kind in ("frames", "quality"):
+            for key, value in getattr(record, kind).items():
+                arrays[f"{i}/{kind}/{key}"] = value
+        arrays[f"{i}/support_disks"] = record.support_disks
+        entries[-1]["record"] = {
+            "name": record.name,
+            "hand_active": record.hand_active,
+            "hand_object": record.hand_object,
+            "objects": [[a.name, a.sha256] for a in record.objects],
+            "info": record.info,
+        }
+    try:
+        arrays["entries"] = np.array(json.dumps(entries))
+        with open_atomic(file) as stream:
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    except OSError as error:
+        logger.warning("%s: motion not cached (%s)", file, error)
+
+
+def read_prepared(file: Path, root: Path) -> list[Prepared] | None:
+    """What ``write_prepared`` kept; None when it, or an object of it, is not there.
+
+    Args:
+        file: from ``cache_file``.
+        root: of the cache, where the objects are.
+    """
+    if not file.is_file():
+        return None
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            entries = json.loads(str(stored["entries"]))
+            items = [_read_item(stored, i, e, root) for i, e in enumerate(entries)]
+    except DAMAGED as error:
+        logger.warning("%s: unreadable (%s); preparing the motion again", file, error)
+        return None
+    return items
+
+
+def _read_item(stored: Any, i: int, entry: dict[str, Any], root: Path) -> Prepared:
+    fields = entry["record"]
+    if fields is None:
+        return Prepared(None, entry["row"])
+    objects = []
+    for name, sha256 in fields["objects"]:
+        asset = read_object(sha256, name=name, cache_dir=root)
+        if asset is None:
+            raise KeyError(f"object {name}")
+        objects.append(asset)
+    parts: dict[str, dict[str, np.ndarray]] = {"frames": {}, "quality": {}}
+    for key in stored.files:
+        words = key.split("/")
+        if words[0] == str(i) and len(words) == 3:
+            parts[words[1]][words[2]] = stored[key]
+    left_active, right_active = fields["hand_active"]
+    left_slot, right_slot = fields["hand_object"]
+    record = MotionRecord(
+        name=fields["name"],
+        frames=parts["frames"],
+        quality=parts["quality"],
+        hand_active=(left_active, right_active),
+        hand_object=(left_slot, right_slot),
+        objects=objects,
+        support_disks=stored[f"{i}/support_disks"],
+        info=fields["info"],
+    )
+    return Prepared(record, entry["row"])

@@ -1,0 +1,147 @@
+"""Jobs over worker processes, or over a Ray cluster, with progress and no lost work."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+
+import torch
+from tqdm import tqdm
+
+from flashdex.motions.checks import Finding
+from flashdex.motions.jobs import Job, Outcome, run_job
+from flashdex.motions.process import reject
+
+_LOG = logging.getLogger(__name__)
+
+LINE_SECONDS = 15.0  # between progress lines where there is no terminal
+# One worker is one core: threads of torch and CoACD would fight over the others.
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def run_jobs(
+    jobs: list[Job], *, workers: int, ray: bool = False, progress: bool | None = None
+) -> list[Outcome]:
+    """Run all jobs; outcomes in the order of the jobs.
+
+    Jobs whose meshes nobody has prepared yet come first, so that workers do not wait
+    for one another's convex parts.
+
+    Args:
+        jobs: one a recording.
+        workers: processes; with one, everything happens in this process.
+        ray: use a Ray cluster instead (the extra 'ray').
+        progress: show a bar; by default when standard error is a terminal, else a line
+            now and then.
+    """
+    order = _new_meshes_first(jobs)
+    queue = [jobs[i] for i in order]
+    if ray:
+        from flashdex.motions.ray_pool import run_on_ray
+
+        stream = run_on_ray(queue)
+    elif workers > 1:
+        stream = _run_in_processes(queue, workers)
+    else:
+        stream = ((i, run_job(job)) for i, job in enumerate(queue))
+    outcomes: dict[int, Outcome] = {}
+    for place, outcome in _show(stream, len(jobs), progress):
+        outcomes[order[place]] = outcome
+    return [outcomes[i] for i in range(len(jobs))]
+
+
+def _new_meshes_first(jobs: list[Job]) -> list[int]:
+    seen: set[str] = set()
+    first, later = [], []
+    for i, job in enumerate(jobs):
+        files = job.recording.files
+        meshes = {str(f) for f in files if f.suffix.lower() in (".obj", ".stl", ".ply")}
+        (first if meshes - seen else later).append(i)
+        seen |= meshes
+    return first + later
+
+
+def _run_in_processes(jobs: list[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+    """Outcomes as they come; a worker that dies takes only its own job with it."""
+    left = dict(enumerate(jobs))
+    while left:
+        suspects: list[int] = []
+        for place, outcome in _run_pool(left, workers, suspects):
+            del left[place]
+            yield place, outcome
+        for place in suspects:  # alone, the one that kills its worker is found
+            job = left.pop(place)
+            alone = list(_run_pool({place: job}, 1, []))
+            yield alone[0] if alone else (place, _died(job))
+
+
+def _run_pool(
+    jobs: dict[int, Job], workers: int, suspects: list[int]
+) -> Iterator[tuple[int, Outcome]]:
+    """Run jobs until they are done or the pool breaks.
+
+    Args:
+        jobs: by place.
+        workers: processes.
+        suspects: filled with the places that were under way when the pool broke.
+    """
+    waiting = list(jobs.items())[::-1]
+    running: dict[Future[Outcome], int] = {}
+    with _pool(workers) as pool:
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    place, job = waiting.pop()
+                    running[pool.submit(run_job, job)] = place
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    outcome = future.result()
+                    yield running.pop(future), outcome
+        except BrokenProcessPool:
+            suspects += running.values()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    for name in THREAD_LIMITS:
+        os.environ.setdefault(name, "1")  # read by the libraries when they load
+    # spawn: a fork of a process that runs torch threads can hang
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(
+        workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)
+    )
+
+
+def _died(job: Job) -> Outcome:
+    text = "the worker process died (out of memory, or a crash in a mesh library)"
+    rejected = reject(job.recording.name, [Finding("E_CRASH", "reject", text)])
+    return Outcome([rejected.row], None, [rejected])
+
+
+def _show(
+    stream: Iterator[tuple[int, Outcome]], total: int, progress: bool | None
+) -> Iterator[tuple[int, Outcome]]:
+    hidden = None if progress is None else not progress
+    counts: Counter[str] = Counter()
+    last = time.monotonic()
+    with tqdm(total=total, disable=hidden, unit="recording") as bar:
+        for done, item in enumerate(stream, start=1):
+            counts.update(row["status"] for row in item[1].rows)
+            told = ", ".join(f"{n} {status}" for status, n in sorted(counts.items()))
+            bar.set_postfix_str(told, refresh=False)
+            bar.update()
+            if bar.disable and progress is None and _is_due(last):
+                last = time.monotonic()
+                _LOG.info("prepared %d of %d recordings: %s", done, total, told)
+            yield item
+
+
+def _is_due(last: float) -> bool:
+    return time.monotonic() - last > LINE_SECONDS

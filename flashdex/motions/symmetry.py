@@ -1,0 +1,75 @@
+"""Bodies of revolution: their turn about the axis cannot be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from flashdex.motions.signed_distance import surface_distance
+
+EQUAL = 0.10  # relative difference of two moments that may be equal
+FAR = 0.03  # of the width: a sample that turns farther off the surface tells
+SHARE = 0.99  # of the samples must stay on the surface: a handle is 2 % of a mug
+NUM_ANGLES = 10
+NUM_SAMPLES = 400
+STEPS = 40  # of the samples that find candidate triangles, across the mesh
+
+
+def revolution_axis(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """The axis of a body of revolution, or None.
+
+    Candidates are the principal axes of the surface whose other two moments are nearly
+    equal. Samples are turned about each by ten angles and must stay on the surface,
+    within 3 % of the largest distance from the axis.
+
+    Args:
+        mesh: triangles, m; needs no watertightness.
+
+    Returns:
+        Unit vector in the mesh's frame, its largest component positive, (3,); the axis
+        passes through the centroid of the surface. Any axis of a sphere.
+    """
+    centre, moments, axes = _surface_moments(np.asarray(mesh.triangles))
+    samples, *_ = trimesh.sample.sample_surface(mesh, NUM_SAMPLES, seed=0)
+    samples = np.asarray(samples) - centre
+    moved = mesh.copy()
+    moved.apply_translation(-centre)
+    for i in range(3):
+        first, second = np.delete(moments, i)
+        if abs(first - second) > EQUAL * max(first, second):
+            continue
+        turned = np.concatenate([samples @ r.T for r in _turns(axes[:, i])])
+        step = float(mesh.extents.max()) / STEPS
+        gaps = surface_distance(moved, turned, step=step)
+        width = np.linalg.norm(np.cross(moved.vertices, axes[:, i]), axis=1).max()
+        if np.quantile(gaps, SHARE) < FAR * width:
+            return axes[:, i] * np.sign(axes[np.abs(axes[:, i]).argmax(), i])
+    return None
+
+
+def _turns(axis: np.ndarray) -> list[np.ndarray]:
+    """Rotation matrices about an axis; angles that no regular prism repeats."""
+    angles = 2 * np.pi * (np.arange(NUM_ANGLES) + 0.5) / (NUM_ANGLES + 0.618)
+    turns = [trimesh.transformations.rotation_matrix(a, axis) for a in angles]
+    return [np.asarray(turn)[:3, :3] for turn in turns]
+
+
+def _surface_moments(
+    triangles: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centroid, and principal moments with their axes (columns), of triangles.
+
+    The integral of x x^T over a triangle of area A and corners v_i is
+    ``A / 12 (sum_i v_i v_i^T + s s^T)`` with ``s = sum_i v_i``.
+    """
+    cross = np.cross(
+        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    )
+    area = np.linalg.norm(cross, axis=1) / 2
+    centre = (area[:, None] * triangles.mean(axis=1)).sum(axis=0) / area.sum()
+    corners = triangles - centre
+    total = corners.sum(axis=1)
+    inner = np.einsum("f,fci,fcj->ij", area, corners, corners)
+    inner += np.einsum("f,fi,fj->ij", area, total, total)
+    moments, axes = np.linalg.eigh(inner / (12 * area.sum()))
+    return centre, moments, axes

@@ -1,0 +1,230 @@
+"""Reads files that hold pickles, without running anything that they ask for.
+
+Licensed datasets come as pickles, object arrays and torch files. All of them are read
+here and only here: the names that data need are allowed and met with stand-ins
+(``stand_ins.py``); every other name is refused and told. Plain numpy arrays are read
+by their announced size. A hostile file may still cost memory, never more.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from flashdex.errors import DemoError
+from flashdex.motions import stand_ins, stand_ins_packages
+from flashdex.motions.stand_ins import MAX_BYTES, RefusedError, StandIn
+
+LFS = b"version https://git-lfs"
+OLD_MODULES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
+SPARSE = {
+    "csc_matrix": stand_ins_packages.SparseColumns,
+    "csr_matrix": stand_ins_packages.SparseRows,
+    "coo_matrix": stand_ins_packages.Sparse,
+}
+ALLOWED: dict[str, Any] = {
+    "numpy.ndarray": stand_ins.ArrayType,
+    "numpy.dtype": stand_ins.Dtype,
+    "numpy.core.multiarray._reconstruct": stand_ins.Array,
+    "numpy.core.multiarray.scalar": stand_ins.Scalar,
+    "numpy.core.numeric._frombuffer": stand_ins.BufferArray,
+    "_codecs.encode": stand_ins.Encoded,
+    "copyreg._reconstructor": stand_ins.Reconstructor,
+    "builtins.object": stand_ins.ObjectType,
+    "builtins.bytes": stand_ins.NoBytes,
+    "builtins.set": set,
+    "builtins.frozenset": frozenset,
+    "collections.OrderedDict": dict,
+    "chumpy.ch.Ch": stand_ins_packages.Chumpy,
+    "chumpy.reordering.Select": stand_ins_packages.ChumpySelect,
+    "torch.storage._load_from_bytes": stand_ins_packages.Storage,
+    "torch._utils._rebuild_tensor": stand_ins_packages.Tensor,
+    "torch._utils._rebuild_tensor_v2": stand_ins_packages.Tensor,
+    "torch._utils._rebuild_parameter": stand_ins_packages.Parameter,
+}
+
+
+class _Unpickler(pickle.Unpickler):
+    """Builds containers, numbers, texts and stand-ins; refuses every other name."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        top = OLD_MODULES.get(module, module).replace("numpy._core", "numpy.core")
+        if top.startswith("scipy.sparse") and name in SPARSE:
+            return SPARSE[name]
+        if f"{top}.{name}" not in ALLOWED or "." in name:
+            raise RefusedError(f"{module}.{name}")
+        return ALLOWED[f"{top}.{name}"]
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise RefusedError(f"an object outside of the file ({str(pid)[:40]})")
+
+
+def load_pickle(path: Path) -> Any:
+    """The content of a pickle, of Python 2 or 3.
+
+    Returns:
+        Plain containers, numbers and texts; numpy arrays; scipy sparse matrices; torch
+        tensors on the CPU without gradient. A chumpy array is a numpy array.
+
+    Raises:
+        DemoError: the file is missing, damaged, or asks for anything else.
+    """
+    return _guard(path, "pickle", lambda file: _unpickle(file))
+
+
+def load_object_array(path: Path) -> Any:
+    """The content of a ``.npy`` file, pickled or not.
+
+    Returns:
+        The array; of a pickled array without dimensions, its only element.
+
+    Raises:
+        DemoError: as ``load_pickle``.
+    """
+    size = path.stat().st_size if path.is_file() else 0
+    return _guard(path, ".npy array", lambda file: _read_array(file, size))
+
+
+def load_npz(path: Path) -> dict[str, Any]:
+    """The entries of a ``.npz`` file, each as ``load_object_array`` gives it.
+
+    Raises:
+        DemoError: as ``load_pickle``, or an entry announces more than 4 GiB.
+    """
+    return _guard(path, ".npz archive", _read_npz)
+
+
+def load_torch(path: Path) -> Any:
+    """The content of a file of ``torch.save``: tensors on the CPU, plain containers.
+
+    Raises:
+        DemoError: as ``load_pickle``.
+    """
+    return _guard(path, "torch file", _read_torch)
+
+
+def _guard(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
+    """Read a file; whatever is wrong with it becomes one clear message."""
+    try:
+        with path.open("rb") as file:
+            if file.read(len(LFS)) == LFS:
+                raise DemoError(
+                    f"{path}: a Git-LFS pointer, not the file itself. Fetch it with "
+                    f"'git lfs pull' or download it anew."
+                )
+            file.seek(0)
+            return read(file)
+    except DemoError:
+        raise
+    except RefusedError as error:
+        raise DemoError(
+            f"{path}: E_PICKLE: it tried to load {error}, which is not data, so it was "
+            f"not read. Don't open it with anything else; get the file anew from where "
+            f"the dataset is published."
+        ) from error
+    except OSError as error:
+        raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
+    # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
+    except Exception as error:
+        told = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DemoError(
+            f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "
+            f"of another kind; unpack or download it anew."
+        ) from error
+
+
+def _unpickle(file: IO[bytes]) -> Any:
+    return to_value(_Unpickler(file, encoding="latin1").load())
+
+
+def to_value(tree: Any) -> Any:
+    """Plain values in place of the stand-ins of a pickle.
+
+    Raises:
+        ValueError: a part is not data, or contains itself.
+    """
+    done: dict[int, Any] = {}
+    busy: set[int] = set()
+
+    def plain(item: Any) -> Any:
+        if item is None or type(item) in (bool, int, float, complex, str):
+            return item
+        key = id(item)  # stays unique: the tree holds every item until the end
+        if key in busy:
+            raise ValueError("a part that contains itself")
+        if key not in done:
+            busy.add(key)
+            done[key] = _convert(item, plain)
+            busy.discard(key)
+        return done[key]
+
+    return plain(tree)
+
+
+def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
+    if isinstance(item, StandIn):
+        return item.value(plain)
+    if type(item) in (list, tuple, set, frozenset):
+        return type(item)([plain(part) for part in item])
+    if type(item) is dict:
+        return {plain(key): plain(part) for key, part in item.items()}
+    if type(item) in (bytes, bytearray):
+        return item
+    raise ValueError(f"a part that is not data ({type(item).__name__})")
+
+
+def _read_array(file: IO[bytes], size: int) -> Any:
+    """An array of .npy bytes; ``size`` is how many there are."""
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
+    elif version == (2, 0):
+        shape, by_columns, dtype = np.lib.format.read_array_header_2_0(file)
+    else:
+        raise ValueError(f"version {version} of the format is not known")
+    if dtype.kind == "O":
+        array = _unpickle(file)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
+            raise ValueError("an object array that holds something else")
+        return array.item() if array.ndim == 0 else array
+    count = math.prod(stand_ins.check_sizes(shape))
+    if dtype.hasobject or count * dtype.itemsize > size:
+        raise ValueError(f"shape {shape} of {dtype} does not fit to {size} bytes")
+    data = file.read(count * dtype.itemsize)
+    flat = np.frombuffer(bytearray(data), dtype, count)
+    return flat.reshape(shape, order="F" if by_columns else "C")
+
+
+def _read_npz(file: IO[bytes]) -> dict[str, Any]:
+    with zipfile.ZipFile(file) as archive:
+        members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+        _check_size(members)
+        if not members:
+            raise ValueError("it holds no .npy entries")
+        entries = {}
+        for member in members:
+            data = io.BytesIO(archive.read(member))
+            name = member.filename.removesuffix(".npy")
+            entries[name] = _read_array(data, member.file_size)
+        return entries
+
+
+def _check_size(members: list[zipfile.ZipInfo]) -> None:
+    size = sum(member.file_size for member in members)
+    if size > MAX_BYTES:
+        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
+
+
+def _read_torch(file: IO[bytes]) -> Any:
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            _check_size(archive.infolist())
+    file.seek(0)
+    return stand_ins_packages.load_tensors(file)

@@ -1,0 +1,264 @@
+"""What the reports of a library show: every recording, its codes, and how bad it is."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flashdex.errors import LibraryError
+from flashdex.motions.library import MotionLibrary
+
+STATUSES = ("rejected", "flagged", "kept")
+# mm, from which on a figure flags a motion: W_IK, W_DEPTH, W_PEN
+LIMITS = {
+    "tip_error_p95_mm": 40.0,
+    "penetration_max_mm": 20.0,
+    "human_tip_depth_mm": 10.0,
+}
+# docs/data.md says the same at more length; a test compares the codes
+CODES = {
+    "E_CRASH": "preparing it ended in an unforeseen fault",
+    "E_DEMO": "unusable: shapes, NaN, quaternions, too few frames",
+    "E_FILE": "files that belong together are missing",
+    "E_KEYS": "a key is missing or has a wrong shape",
+    "E_LEN": "hands and objects have different numbers of frames",
+    "E_MANO": "MANO files missing, wrong, or sides swapped",
+    "E_MESH": "mesh missing, unreadable or without volume",
+    "E_NAN": "values missing for too long",
+    "E_PICKLE": "the file asks for code to be run; it is not read",
+    "E_READ": "the recording cannot be read",
+    "E_ROOT": "expected folders are absent",
+    "E_ROT": "not a rotation",
+    "E_UNIT": "palm, object or reach of a wrong size: metres?",
+    "I_DUP": "the same content as another recording",
+    "R_BELOW": "object more than 5 cm below the table",
+    "R_CONTACT": "the object moves, but no fingertip comes within 2 cm",
+    "R_INACTIVE": "no hand touches an object",
+    "R_LONG": "over 20 s: cut it",
+    "R_SHORT": "under 1 s",
+    "W_ACCEL": "wrist accelerates with more than 60 m/s2",
+    "W_DEPTH": "robot hand over 20 mm inside an object, or in the table",
+    "W_FPS": "measured rate differs from the announced one",
+    "W_GAP": "frames are missing",
+    "W_HULL": "the convex hull is far larger than the mesh",
+    "W_IK": "robot tips far off the human's, or joints at their limits",
+    "W_JUMP": "hand or object jumps",
+    "W_MISSHAND": "a hand is missing for much of the motion",
+    "W_OBJOBJ": "objects inside each other at the first frame",
+    "W_PARTS": "too many convex parts",
+    "W_PEN": "human fingertip over 10 mm inside the object",
+    "W_SHAPE": "no hand shape: an average hand is used",
+    "W_STATIC": "touched, but no object moves",
+    "W_SUPPORT": "nothing rests, or an object rests below the table",
+    "W_SYM": "the object is rotationally symmetric",
+    "W_UP": "the up axis looks wrong",
+    "W_WATER": "mesh not watertight",
+}
+_CODE = re.compile(r"(?:^|; )([A-Z]_[A-Z0-9]+): ")
+
+
+@dataclass(frozen=True)
+class RecordingFacts:
+    """One row of ``report.csv``.
+
+    Names and reasons come from the files that were read: show them escaped only.
+
+    Args:
+        name: of the motion.
+        status: kept, flagged or rejected.
+        reason: codes with their text.
+        figures: every other column, as written.
+        row: of the library, None when it is not in it.
+        source: dataset.
+        licence: of the dataset, empty when not known.
+    """
+
+    name: str
+    status: str
+    reason: str
+    figures: Mapping[str, str] = field(default_factory=dict)
+    row: int | None = None
+    source: str = ""
+    licence: str = ""
+
+    @property
+    def codes(self) -> list[str]:
+        """Codes of the reason, each once."""
+        return list(dict.fromkeys(_CODE.findall(self.reason)))
+
+    @property
+    def badness(self) -> float:
+        """Largest figure in units of the limit beyond which it flags a motion."""
+        shares = [
+            value / limit
+            for column, limit in LIMITS.items()
+            if (value := self.value(column)) is not None
+        ]
+        return max(shares, default=0.0)
+
+    def value(self, column: str) -> float | None:
+        """A figure as a number; None when it is not there or not finite.
+
+        Args:
+            column: of ``report.csv``.
+        """
+        try:
+            value = float(self.figures.get(column, ""))
+        except ValueError:
+            return None
+        return value if math.isfinite(value) else None
+
+
+def library_facts(library: MotionLibrary) -> list[RecordingFacts]:
+    """Every recording of a library, rejected ones too, the worst first.
+
+    Rejected recordings are only in ``report.csv``; a motion that it does not name is
+    taken from the manifest.
+
+    Args:
+        library: the prepared collection.
+
+    Raises:
+        LibraryError: ``report.csv`` is not a table.
+    """
+    written = _read_report(library.path / "report.csv")
+    motions = {m["name"]: m for m in library.manifest["motions"]}
+    rows = {name: row for row, name in enumerate(library.names)}
+    facts = []
+    for line in written:
+        name = line.get("motion", "")
+        inside = line.get("status") != "rejected" and name in rows
+        row = rows.pop(name, None) if inside else None
+        info = motions[name] if row is not None else {}
+        facts.append(_make(line, info, row, _source_of(library)))
+    for name, row in rows.items():
+        seconds = int(library.motions["length"][row]) / library.fps
+        line = {"motion": name, "status": "kept", **_texts(motions[name])}
+        line["seconds"] = f"{seconds:.3f}"
+        facts.append(_make(line, motions[name], row, _source_of(library)))
+    return worst_first(facts)
+
+
+def facts_of_rows(rows: Iterable[Mapping[str, Any]]) -> list[RecordingFacts]:
+    """The same of rows that ``prepare`` has made, the worst first.
+
+    Args:
+        rows: columns of ``report.csv`` by name.
+    """
+    lines = [{k: str(v) for k, v in row.items() if v is not None} for row in rows]
+    return worst_first([_make(line, {}, None, "") for line in lines])
+
+
+def worst_first(facts: Iterable[RecordingFacts]) -> list[RecordingFacts]:
+    """Rejected before flagged before kept; within each the worst figure first.
+
+    Args:
+        facts: recordings.
+    """
+
+    def place(one: RecordingFacts) -> tuple[int, float]:
+        known = one.status in STATUSES
+        return STATUSES.index(one.status) if known else len(STATUSES), -one.badness
+
+    return sorted(facts, key=place)
+
+
+def columns_of(facts: Sequence[RecordingFacts]) -> list[str]:
+    """Columns of ``report.csv`` besides motion, status and reason, in order.
+
+    Args:
+        facts: recordings; a rejected one may have fewer columns.
+    """
+    longest = sorted(facts, key=lambda one: -len(one.figures))
+    return list(dict.fromkeys(column for one in longest for column in one.figures))
+
+
+def count_statuses(facts: Iterable[RecordingFacts]) -> dict[str, int]:
+    """Number of recordings of each status, every status named.
+
+    Args:
+        facts: recordings.
+    """
+    counts = Counter(one.status for one in facts)
+    return {status: counts[status] for status in reversed(STATUSES)}
+
+
+def count_codes(facts: Sequence[RecordingFacts]) -> dict[str, dict[str, int]]:
+    """Recordings of each status by code, the most frequent code first.
+
+    Args:
+        facts: recordings; a code counts once in each.
+    """
+    totals = Counter(code for one in facts for code in one.codes)
+    return {
+        code: count_statuses(one for one in facts if code in one.codes)
+        for code, _ in totals.most_common()
+    }
+
+
+def by_source(facts: Iterable[RecordingFacts]) -> dict[str, list[RecordingFacts]]:
+    """Recordings by source, the largest first.
+
+    Args:
+        facts: recordings.
+    """
+    groups: dict[str, list[RecordingFacts]] = {}
+    for one in facts:
+        groups.setdefault(one.source or "not recorded", []).append(one)
+    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+def seconds_of(facts: Iterable[RecordingFacts]) -> float:
+    """Seconds of the motions that are not rejected.
+
+    Args:
+        facts: recordings.
+    """
+    inside = (one for one in facts if one.status != "rejected")
+    return sum(one.value("seconds") or 0.0 for one in inside)
+
+
+def _make(
+    line: Mapping[str, str], info: Mapping[str, Any], row: int | None, source: str
+) -> RecordingFacts:
+    own = ("motion", "status", "reason")
+    return RecordingFacts(
+        name=line.get("motion", ""),
+        status=line.get("status", ""),
+        reason=line.get("reason", ""),
+        figures={k: v for k, v in line.items() if k not in own},
+        row=row,
+        source=str(line.get("source") or info.get("source") or source),
+        licence=str(info.get("licence") or line.get("licence") or ""),
+    )
+
+
+def _texts(info: Mapping[str, Any]) -> dict[str, str]:
+    """What the manifest says about status and reason of a motion."""
+    return {k: str(info[k]) for k in ("status", "reason") if k in info}
+
+
+def _source_of(library: MotionLibrary) -> str:
+    # a library of several sources has a list here, which says nothing about one motion
+    source = library.manifest.get("source", "")
+    return source if isinstance(source, str) else ""
+
+
+def _read_report(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    try:
+        with path.open(encoding="utf-8", errors="replace", newline="") as file:
+            lines = list(csv.DictReader(file, restkey="", restval=""))
+    except (OSError, csv.Error) as error:
+        raise LibraryError(
+            f"{path}: not a readable table ({error}). Prepare the library again."
+        ) from error
+    # cells beyond the heading have no name and are left out
+    return [{k: v for k, v in line.items() if k} for line in lines]

@@ -1,0 +1,276 @@
+"""Stills of a library: ``python -m flashdex.viz.library_thumbs LIBRARY OUT ROW...``.
+
+The robot reference is drawn with the objects' visual meshes. As with films, drawing
+happens in a process of its own: graphics that crash take no report with them.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from flashdex.errors import FlashdexError
+from flashdex.geometry.rotation import quat_rotate
+from flashdex.hands.attach import add_hand
+from flashdex.hands.spec import load_hand
+from flashdex.keys import SIDES
+from flashdex.motions.contacts import contact_runs
+from flashdex.motions.library import MotionLibrary
+from flashdex.viz import film
+from flashdex.viz.camera import fit_view, view_axes
+from flashdex.viz.frames import AZIMUTHS, ELEVATION, dress_scene
+
+WIDTH, HEIGHT = 256, 192  # of one still, pixels
+QUALITY = 80  # of the JPEG
+SECONDS_A_MOTION = 20  # software drawing on a busy machine
+COLOURS = ((0.85, 0.55, 0.25, 1.0), (0.3, 0.6, 0.4, 1.0), (0.45, 0.45, 0.75, 1.0))
+DISC = (0.8, 0.8, 0.78, 1.0)
+
+
+def draw_thumbnails(
+    library: MotionLibrary, rows: Sequence[int]
+) -> tuple[dict[int, bytes], str]:
+    """Draw a strip of stills of each motion, at ``still_frames``.
+
+    Args:
+        library: the prepared collection.
+        rows: motions to draw.
+
+    Returns:
+        JPEG data by motion row, and why pictures are missing, empty when all are there.
+        Never raises: a library is worth reporting without pictures.
+    """
+    backend = film.find_backend() if rows else None
+    if backend is None:
+        return {}, film.NO_GRAPHICS if rows else ""
+    with tempfile.TemporaryDirectory(prefix="flashdex-stills-") as folder:
+        module = "flashdex.viz.library_thumbs"
+        words = ["-m", module, str(library.path.resolve()), folder, *map(str, rows)]
+        timeout = 60 + SECONDS_A_MOTION * len(rows)
+        fault = film._run(words, backend, timeout=timeout)
+        files = {row: Path(folder) / f"{row}.jpg" for row in rows}
+        drawn = {row: f.read_bytes() for row, f in files.items() if f.is_file()}
+    if len(drawn) == len(rows):
+        return drawn, ""
+    missing = f"{len(rows) - len(drawn)} of {len(rows)} motions"
+    return drawn, f"no pictures of {missing}: {fault or 'unknown fault'}"
+
+
+def frames_of(library: MotionLibrary, row: int) -> slice:
+    """Rows of the frame axis that belong to a motion.
+
+    Args:
+        library: the prepared collection.
+        row: motion.
+    """
+    start = int(library.motions["start"][row])
+    return slice(start, start + int(library.motions["length"][row]))
+
+
+def contact_of(library: MotionLibrary, row: int) -> np.ndarray:
+    """Human fingers in contact, (T, 2, 5) bool, hands [left, right].
+
+    Args:
+        library: where no contacts are stored, they follow from the tip distances.
+        row: motion.
+    """
+    span = frames_of(library, row)
+    if library.quality is not None:
+        return library.quality["contact"][span].bool().numpy()
+    gaps = library.frames["tip_dist"][span].numpy()
+    hands = [contact_runs(gaps[:, hand], library.fps) for hand in range(len(SIDES))]
+    active = library.motions["hand_active"][row].bool().numpy()
+    return np.stack(hands, axis=1) & active[:, None]
+
+
+def still_frames(library: MotionLibrary, row: int) -> dict[str, int]:
+    """Frames worth a picture: start, first contact, middle, end.
+
+    Args:
+        library: the prepared collection.
+        row: motion.
+
+    Returns:
+        Four frames of the motion by word; without contact, a quarter stands in.
+    """
+    touched = np.flatnonzero(contact_of(library, row).any(axis=(1, 2)))
+    length = int(library.motions["length"][row])
+    first = {"contact": int(touched[0])} if len(touched) else {"quarter": length // 4}
+    return {"start": 0, **first, "middle": length // 2, "end": length - 1}
+
+
+class StillPainter:
+    """Draws single frames of a motion's reference.
+
+    Args:
+        library: the prepared collection.
+        row: motion.
+
+    Raises:
+        FlashdexError: the hand is unknown.
+    """
+
+    def __init__(self, library: MotionLibrary, row: int) -> None:
+        hands = load_hand(library.hand)
+        self._frames = library.frames[frames_of(library, row)]
+        self._hands = library.motions["hand_active"][row].nonzero()[:, 0].tolist()
+        rows = library.motions["object_index"][row].tolist()
+        self._objects = [int(r) for r in rows if r >= 0]
+        self._corners = _corners(library.objects["aabb"][self._objects])
+        scene = mujoco.MjSpec()
+        for hand in self._hands:
+            add_hand(scene, hands[SIDES[hand]])
+        for slot, object_row in enumerate(self._objects):
+            _add_object(scene, library, object_row, slot)
+        _add_discs(scene, library.motions["support_disks"][row].tolist())
+        dress_scene(scene, width=WIDTH, height=HEIGHT)
+        self.model = scene.compile()
+        self._data = mujoco.MjData(self.model)
+        self._renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
+        self._azimuth = self._choose_azimuth()
+
+    def close(self) -> None:
+        """Free the graphics context."""
+        self._renderer.close()
+
+    def draw(self, frame: int) -> np.ndarray:
+        """Picture of one frame, as near as it may be, (HEIGHT, WIDTH, 3) uint8.
+
+        Args:
+            frame: of the motion.
+        """
+        self._place(frame)
+        camera = self._make_camera(self._azimuth, frame)
+        self._renderer.update_scene(self._data, camera)
+        return self._renderer.render()
+
+    def _place(self, frame: int) -> None:
+        data, now = self._data, self._frames[frame]
+        # the joints of a hand stand together, in the order of its spec
+        data.qpos[:] = now["joint_pos"][self._hands].numpy().ravel()
+        for slot in range(len(self._objects)):
+            data.mocap_pos[slot] = now["object_pos"][slot].numpy()
+            data.mocap_quat[slot] = now["object_quat"][slot].numpy()
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_camlight(self.model, data)
+
+    def _choose_azimuth(self) -> float:
+        """Look from where the most of the objects is seen half way through."""
+        middle = len(self._frames) // 2
+        self._place(middle)
+        self._renderer.enable_segmentation_rendering()
+        cameras = [self._make_camera(azimuth, middle) for azimuth in AZIMUTHS]
+        seen = [self._count_object_pixels(camera) for camera in cameras]
+        self._renderer.disable_segmentation_rendering()
+        return AZIMUTHS[int(np.argmax(seen))]
+
+    def _make_camera(self, azimuth: float, frame: int) -> mujoco.MjvCamera:
+        camera = mujoco.MjvCamera()
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.azimuth, camera.elevation = azimuth, ELEVATION
+        camera.lookat[:], camera.distance = fit_view(
+            self._points(frame),
+            view_axes(azimuth, ELEVATION),
+            fovy=float(self.model.vis.global_.fovy),
+            aspect=WIDTH / HEIGHT,
+        )
+        return camera
+
+    def _points(self, frame: int) -> np.ndarray:
+        """World positions that must be in sight, m, (n, 3)."""
+        now = self._frames[frame]
+        hands = now["keypoints"][self._hands].reshape(-1, 3)
+        slots = slice(len(self._objects))
+        pos, quat = now["object_pos"][slots], now["object_quat"][slots]
+        objects = (quat_rotate(quat[:, None], self._corners) + pos[:, None]).flatten(
+            0, 1
+        )
+        points = torch.cat([hands, objects]).double().numpy()
+        return points[np.isfinite(points).all(axis=1)]
+
+    def _count_object_pixels(self, camera: mujoco.MjvCamera) -> int:
+        self._renderer.update_scene(self._data, camera)
+        ids = self._renderer.render()[..., 0]
+        moved = self.model.body_mocapid[self.model.geom_bodyid] >= 0
+        return int(np.isin(ids, np.flatnonzero(moved)).sum())
+
+
+def _corners(boxes: Tensor) -> Tensor:
+    """Corners of boxes, object frame, m, (n, 8, 3)."""
+    picks = torch.cartesian_prod(*[torch.arange(2)] * 3)
+    return boxes[:, picks, torch.arange(3)]
+
+
+def _add_object(
+    scene: mujoco.MjSpec, library: MotionLibrary, row: int, slot: int
+) -> None:
+    name = f"object{slot}"
+    visual = library.visual(row)
+    mesh = scene.add_mesh(name=name)
+    mesh.uservert = np.asarray(visual.vertices, dtype=float).ravel()
+    mesh.userface = np.asarray(visual.faces, dtype=np.int32).ravel()
+    # nothing is simulated, and an open surface has no volume
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    body = scene.worldbody.add_body(name=name, mocap=True)
+    geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+    geom.rgba = COLOURS[slot % len(COLOURS)]
+    geom.contype = geom.conaffinity = 0
+
+
+def _add_discs(scene: mujoco.MjSpec, discs: list[list[float]]) -> None:
+    for x, y, top, radius, height in discs:
+        if np.isfinite(top):
+            scene.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+                size=[radius, height / 2, 0],
+                pos=[x, y, top - height / 2],
+                rgba=DISC,
+            )
+
+
+def write_strip(library: MotionLibrary, row: int, path: Path) -> None:
+    """Draw the four stills of a motion side by side, JPEG.
+
+    Args:
+        library: the prepared collection.
+        row: motion.
+        path: the picture.
+    """
+    painter = StillPainter(library, row)
+    try:
+        stills = [painter.draw(t) for t in still_frames(library, row).values()]
+    finally:
+        painter.close()
+    strip = Image.fromarray(np.concatenate(stills, axis=1))
+    strip.save(path, quality=QUALITY, optimize=True)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draw motions of a library into a folder; report faults on stderr.
+
+    Args:
+        argv: library, folder, rows.
+    """
+    library, folder = MotionLibrary.load(argv[0]), Path(argv[1])
+    faults = 0
+    for row in map(int, argv[2:]):
+        try:
+            write_strip(library, row, folder / f"{row}.jpg")
+        except (FlashdexError, OSError, ValueError) as error:
+            faults += 1
+            line = " ".join(str(error).split())
+            sys.stderr.write(f"{library.names[row]}: {line}\n")
+    return int(faults > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

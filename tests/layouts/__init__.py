@@ -1,0 +1,1 @@
+"""Writers of dataset folders with synthetic content, one file a layout."""

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from flashdex.cli_data import add_data_verbs
 from flashdex.errors import FlashdexError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -85,6 +86,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("doctor", _doctor, "say what this computer has and what is missing")
     add("ls", _ls, "list the recipes with the numbers they promise")
     _add_recipe_verbs(add)
+    add_data_verbs(add)
     _add_run_verbs(add)
     return parser
 
@@ -98,39 +100,6 @@ def _add_recipe_verbs(
 
     verb = add("validate", _validate, "find every mistake in recipes")
     verb.add_argument("paths", nargs="+", metavar="PATH", help="recipe or folder")
-
-    verb = add("fetch", _fetch, "download recordings that need no registration")
-    verb.add_argument("name", help="myodm: 95 clips of one hand and one object")
-    verb.add_argument("--out", type=Path, help="folder (default: in the cache)")
-    verb.add_argument("--wheel", type=Path, help="package file fetched by other means")
-
-    verb = add("prepare", _prepare, "make a motion library from recordings")
-    verb.add_argument("--source", required=True, help="reader: see `flashdex ls`")
-    verb.add_argument("--input", type=Path, help="what the source reads")
-    verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
-    verb.add_argument("--out", type=Path, help="folder of the library")
-    verb.add_argument("--mano", type=Path, help="folder with MANO_LEFT, MANO_RIGHT")
-    verb.add_argument("--models", type=Path, help="folder of the object models")
-    verb.add_argument("--splits", type=Path, help="file that names the splits")
-    verb.add_argument("--hz", type=float, default=60.0, help="control rate, 1/s")
-    verb.add_argument("--speed", type=float, default=1.0, help="of playback")
-    verb.add_argument(
-        "--cut",
-        choices=["auto", "always", "never"],
-        default="auto",
-        help="cut where contact begins and ends (auto: sessions and over 20 s)",
-    )
-    verb.add_argument("--strict", action="store_true", help="reject what is flagged")
-    verb.add_argument("--workers", type=int, default=1, help="processes (%(default)s)")
-    verb.add_argument("--ray", action="store_true", help="use a Ray cluster")
-    verb.add_argument("--limit", type=int, help="only the first N recordings")
-    verb.add_argument("--seed", type=int, default=0)
-    verb.add_argument(
-        "--no-thumbnails", action="store_true", help="report.html without pictures"
-    )
-    verb.add_argument(
-        "--dry-run", action="store_true", help="list the recordings and stop"
-    )
 
 
 def _add_run_verbs(
@@ -185,9 +154,8 @@ def _doctor(args: argparse.Namespace) -> int:
 
 
 def _ls(args: argparse.Namespace) -> int:
-    from flashdex.recipe.store import format_listing, list_recipes
-
     from flashdex.motions.sources import format_sources
+    from flashdex.recipe.store import format_listing, list_recipes
 
     print(format_listing(list_recipes()))
     print(format_sources())
@@ -209,73 +177,13 @@ def _validate(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fetch(args: argparse.Namespace) -> int:
-    from flashdex.motions.fetch import NOTE, fetch
-
-    folder = fetch(args.name, args.out, wheel=args.wheel)
-    where = "" if args.out is None else f" --input {folder}"
-    print(f"{NOTE}\n{folder}")
-    print(f"next: flashdex prepare --source {args.name}{where} --out libraries/myodm")
-    return 0
-
-
-def _prepare(args: argparse.Namespace) -> int:
-    from flashdex.motions.prepare import prepare
-    from flashdex.viz.library_report import summary_lines, write_library_report
-
-    if args.dry_run:
-        return _list_recordings(args)
-    if args.out is None:
-        raise FlashdexError("prepare: --out is missing: the folder of the library")
-    library = prepare(
-        source=args.source,
-        input=args.input,
-        hand=args.hand,
-        out=args.out,
-        control_hz=args.hz,
-        workers=args.workers,
-        ray=args.ray,
-        limit=args.limit,
-        seed=args.seed,
-        mano=args.mano,
-        models=args.models,
-        splits=args.splits,
-        cut=args.cut,
-        speed=args.speed,
-        strict=args.strict,
-    )
-    report = write_library_report(library, thumbnails=not args.no_thumbnails)
-    print("\n".join(summary_lines(library)))
-    print(f"{library.path}: figures in report.csv, pictures in {report}")
-    return 0
-
-
-def _list_recordings(args: argparse.Namespace) -> int:
-    from flashdex.motions.recording import SourceOptions
-    from flashdex.motions.sources import list_recordings
-
-    options = SourceOptions(
-        path=args.input,
-        mano=args.mano,
-        models=args.models,
-        splits=args.splits,
-        seed=args.seed,
-        limit=args.limit,
-    )
-    recordings = list_recordings(args.source, options)
-    for recording in recordings:
-        size = sum(file.stat().st_size for file in recording.files)
-        print(f"{recording.name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
-    print(f"{len(recordings)} recordings")
-    return 0
-
-
 def _baselines(args: argparse.Namespace) -> int:
-    from flashdex.recipe import compose
+    from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.baselines import format_baselines, score_baselines
     from flashdex.training.setup import open_workbench
 
-    bench = open_workbench(compose(args.recipe, args.overrides))
+    recipe = compose(args.recipe, args.overrides)
+    bench = open_workbench(expect_kind(recipe, Recipe, where="baselines"))
     if args.out is not None:
         args.out.unlink(missing_ok=True)  # scores of another time are no answer
     print(format_baselines(score_baselines(bench, args.out)))

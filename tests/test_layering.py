@@ -43,7 +43,7 @@ OPTIONAL = {
     "wandb": {"training/logging.py"},
     "viser": {"viz/viewer.py", "viz/page.py"},
     "mjviser": {"viz/viewer.py", "viz/page.py"},
-    "ray": {"training/distributed.py"},
+    "ray": {"motions/ray_pool.py", "training/distributed.py"},
     "gymnasium": {"training/gym.py"},
     "h5py": {"export/robomimic.py"},
     "pyarrow": {"export/lerobot.py"},

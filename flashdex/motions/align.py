@@ -18,7 +18,7 @@ from flashdex.motions.contacts import (
 )
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
-from flashdex.motions.meshes import clean_mesh
+from flashdex.motions.meshes import clean_mesh, hull_vertices
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import (
     continuous,
@@ -86,7 +86,7 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
     poses = [transform_pose(b.pose, turn) for b in demo.objects]
     height, found = demo.support_z, True
     if height is None:
-        vertices = [np.asarray(m.vertices) for m in meshes]
+        vertices = [hull_vertices(m) for m in meshes]
         height, found = estimate_support(poses, vertices, demo.fps)
     times = sample_times(demo.num_frames, demo.fps, control_hz)
     lift = np.array([0.0, 0.0, -height])

@@ -31,9 +31,9 @@ LICENCES = {
     "LICENSE.objects": "myosuite/simhive/object_sim/LICENSE",
 }
 NOTE = (
-    "MyoDM: software, hand model and meshes are Apache-2.0 (licences beside the clips). "
-    "The motions are kinematic fits to mocap of GRAB; the authors ask users to respect "
-    "GRAB's licence: non-commercial research, no redistribution of the data."
+    "MyoDM: software, hand model and meshes are Apache-2.0 (licences beside the "
+    "clips). The motions are kinematic fits to mocap of GRAB; the authors ask users to "
+    "respect GRAB's licence: non-commercial research, no redistribution of the data."
 )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.errors import DemoError, MeshError
-from flashdex.motions.checks import MAX_SECONDS, Finding
+from flashdex.motions.checks import MAX_SECONDS, Finding, concerning
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
 from flashdex.motions.objects import default_cache_dir
@@ -101,16 +101,24 @@ def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
     """
     demo = _paced(demo, settings.speed)
     demo.validate(complete=False)
-    pieces, findings = repair(demo)
-    done: list[Prepared] = []
-    for piece in pieces:
-        parts, remarks = [piece], list[Finding]()
-        if _is_cut(piece, settings):
-            parts, remarks = segment(piece)
-        if not parts:
-            done.append(reject(piece.name, findings + remarks))
-        done += [prepare_motion(p, settings, findings + remarks) for p in parts]
-    return done or [reject(demo.name, findings)]
+    is_cut = _is_cut(demo, settings)
+    pieces, findings = repair(demo, keep_gaps=is_cut)
+    findings += _notes(demo)
+    if is_cut and pieces:
+        pieces, remarks = segment(pieces[0])
+        findings += remarks
+    if not pieces:
+        return [reject(demo.name, findings)]
+    return [prepare_motion(p, settings, concerning(findings, p)) for p in pieces]
+
+
+def _notes(demo: HumanDemo) -> list[Finding]:
+    """Remarks of the reader: ``CODE: text``."""
+    found = []
+    for note in demo.provenance.get("notes", []):
+        code, _, text = str(note).partition(": ")
+        found.append(Finding(code, "warn" if code[:2] == "W_" else "info", text))
+    return found
 
 
 def _paced(demo: HumanDemo, speed: float) -> HumanDemo:

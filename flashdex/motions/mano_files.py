@@ -107,16 +107,17 @@ def read_mano(file: Path, side: Side) -> ManoArrays:
 
 def _array(file: Path, key: str, value: Any) -> np.ndarray:
     """One part as a dense float64 array of the expected shape."""
+    shape = tuple(getattr(value, "shape", ()))
+    if shape != SHAPES[key]:
+        raise DemoError(
+            f"E_MANO: {file}: {key} has shape {shape}, expected {SHAPES[key]}. "
+            f"MANO_LEFT and MANO_RIGHT of mano_v1_2.zip are read, no other model."
+        )
     dense = value.toarray() if hasattr(value, "toarray") else value
     try:
         array = np.array(dense, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DemoError(f"E_MANO: {file}: {key} does not hold numbers.") from error
-    if array.shape != SHAPES[key]:
-        raise DemoError(
-            f"E_MANO: {file}: {key} has shape {array.shape}, expected {SHAPES[key]}. "
-            f"MANO_LEFT and MANO_RIGHT of mano_v1_2.zip are read, no other model."
-        )
     if not np.isfinite(array).all():
         raise DemoError(f"E_MANO: {file}: {key} holds NaN or infinity.")
     array.setflags(write=False)  # one model serves all recordings of a worker

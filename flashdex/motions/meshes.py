@@ -80,6 +80,15 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     return mesh
 
 
+def hull_vertices(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """Vertices of the convex hull, m, (V, 3): all that touches a table is among them.
+
+    Args:
+        mesh: with a hull of some volume.
+    """
+    return np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
+
+
 def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh is empty (no triangles). Export it again.")

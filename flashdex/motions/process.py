@@ -23,6 +23,7 @@ from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
+from flashdex.motions.meshes import hull_vertices
 from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.residuals import RetargetWeights, Targets
@@ -180,7 +181,7 @@ def _record(
     choice: Choice,
     targets: Targets,
 ) -> MotionRecord:
-    vertices = [np.asarray(m.vertices) for m in aligned.meshes]
+    vertices = [hull_vertices(m) for m in aligned.meshes]
     left, right = map(bool, aligned.active)
     left_slot, right_slot = map(int, aligned.hand_object)
     best = choice.best

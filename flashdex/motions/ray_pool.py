@@ -20,7 +20,7 @@ def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
         MissingExtraError: Ray is not installed.
     """
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingExtraError("ray", extra="ray") from error
     started = not ray.is_initialized()

@@ -2,8 +2,8 @@
 
 Licensed datasets come as pickles, object arrays and torch files. All of them are read
 here and only here: the names that data need are allowed and met with stand-ins
-(``stand_ins.py``); every other name is refused and told. Plain numpy arrays are read
-by their announced size. A hostile file may still cost memory, never more.
+(``stand_ins``); every other name is refused and told. Plain numpy arrays are read
+by their announced size. No file becomes more than 4 GiB.
 """
 
 from __future__ import annotations
@@ -19,35 +19,41 @@ from typing import IO, Any
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.motions import stand_ins, stand_ins_packages
-from flashdex.motions.stand_ins import MAX_BYTES, RefusedError, StandIn
+from flashdex.motions.stand_ins import arrays, containers, sparse, tensors
+from flashdex.motions.stand_ins.base import (
+    MAX_BYTES,
+    RefusedError,
+    StandIn,
+    check_pickle,
+    check_sizes,
+)
 
 LFS = b"version https://git-lfs"
 OLD_MODULES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
 SPARSE = {
-    "csc_matrix": stand_ins_packages.SparseColumns,
-    "csr_matrix": stand_ins_packages.SparseRows,
-    "coo_matrix": stand_ins_packages.Sparse,
+    "csc_matrix": sparse.SparseColumns,
+    "csr_matrix": sparse.SparseRows,
+    "coo_matrix": sparse.Sparse,
 }
 ALLOWED: dict[str, Any] = {
-    "numpy.ndarray": stand_ins.ArrayType,
-    "numpy.dtype": stand_ins.Dtype,
-    "numpy.core.multiarray._reconstruct": stand_ins.Array,
-    "numpy.core.multiarray.scalar": stand_ins.Scalar,
-    "numpy.core.numeric._frombuffer": stand_ins.BufferArray,
-    "_codecs.encode": stand_ins.Encoded,
-    "copyreg._reconstructor": stand_ins.Reconstructor,
-    "builtins.object": stand_ins.ObjectType,
-    "builtins.bytes": stand_ins.NoBytes,
-    "builtins.set": set,
-    "builtins.frozenset": frozenset,
-    "collections.OrderedDict": dict,
-    "chumpy.ch.Ch": stand_ins_packages.Chumpy,
-    "chumpy.reordering.Select": stand_ins_packages.ChumpySelect,
-    "torch.storage._load_from_bytes": stand_ins_packages.Storage,
-    "torch._utils._rebuild_tensor": stand_ins_packages.Tensor,
-    "torch._utils._rebuild_tensor_v2": stand_ins_packages.Tensor,
-    "torch._utils._rebuild_parameter": stand_ins_packages.Parameter,
+    "numpy.ndarray": arrays.ArrayType,
+    "numpy.dtype": arrays.Dtype,
+    "numpy.core.multiarray._reconstruct": arrays.Array,
+    "numpy.core.multiarray.scalar": arrays.Scalar,
+    "numpy.core.numeric._frombuffer": arrays.BufferArray,
+    "_codecs.encode": containers.Encoded,
+    "copyreg._reconstructor": containers.Reconstructor,
+    "builtins.object": containers.ObjectType,
+    "builtins.bytes": containers.NoBytes,
+    "builtins.set": containers.MutableSet,
+    "builtins.frozenset": containers.FrozenSet,
+    "collections.OrderedDict": containers.Ordered,
+    "chumpy.ch.Ch": arrays.Chumpy,
+    "chumpy.reordering.Select": arrays.ChumpySelect,
+    "torch.storage._load_from_bytes": tensors.Storage,
+    "torch._utils._rebuild_tensor": tensors.Tensor,
+    "torch._utils._rebuild_tensor_v2": tensors.Tensor,
+    "torch._utils._rebuild_parameter": tensors.Parameter,
 }
 
 
@@ -141,19 +147,24 @@ def _guard(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
 
 
 def _unpickle(file: IO[bytes]) -> Any:
-    return to_value(_Unpickler(file, encoding="latin1").load())
+    data = io.BytesIO(file.read())
+    check_pickle(data)
+    data.seek(0)
+    return to_value(_Unpickler(data, encoding="latin1").load())
 
 
 def to_value(tree: Any) -> Any:
     """Plain values in place of the stand-ins of a pickle.
 
     Raises:
-        ValueError: a part is not data, or contains itself.
+        ValueError: a part is not data, contains itself, or all is too large.
     """
     done: dict[int, Any] = {}
     busy: set[int] = set()
+    size = 0
 
     def plain(item: Any) -> Any:
+        nonlocal size
         if item is None or type(item) in (bool, int, float, complex, str):
             return item
         key = id(item)  # stays unique: the tree holds every item until the end
@@ -161,11 +172,19 @@ def to_value(tree: Any) -> Any:
             raise ValueError("a part that contains itself")
         if key not in done:
             busy.add(key)
-            done[key] = _convert(item, plain)
+            made = done[key] = _convert(item, plain)
             busy.discard(key)
+            # one part of the file may be asked for in many forms, each a copy
+            size += getattr(made, "nbytes", 0) or 8 * _length(made)
+            if size > MAX_BYTES:
+                raise ValueError("it becomes more than 4 GiB")
         return done[key]
 
     return plain(tree)
+
+
+def _length(made: Any) -> int:
+    return len(made) if isinstance(made, (list, tuple, dict, set, frozenset)) else 0
 
 
 def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
@@ -194,7 +213,7 @@ def _read_array(file: IO[bytes], size: int) -> Any:
         if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
             raise ValueError("an object array that holds something else")
         return array.item() if array.ndim == 0 else array
-    count = math.prod(stand_ins.check_sizes(shape))
+    count = math.prod(check_sizes(shape))
     if dtype.hasobject or count * dtype.itemsize > size:
         raise ValueError(f"shape {shape} of {dtype} does not fit to {size} bytes")
     data = file.read(count * dtype.itemsize)
@@ -227,4 +246,4 @@ def _read_torch(file: IO[bytes]) -> Any:
         with zipfile.ZipFile(file) as archive:
             _check_size(archive.infolist())
     file.seek(0)
-    return stand_ins_packages.load_tensors(file)
+    return tensors.load_tensors(file)

@@ -40,9 +40,7 @@ def _motions(recipe: Recipe) -> list[str]:
     if motions.library is not None:
         return []
     if motions.source not in ("procedural", "myodm") and motions.input is None:
-        return [
-            f"motions.input: missing; the source '{motions.source}' reads a folder"
-        ]
+        return [f"motions.input: missing; the source '{motions.source}' reads a folder"]
     return []
 
 

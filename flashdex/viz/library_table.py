@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Sequence
 
 from flashdex.viz.html import Html, joined, safe, tag
+from flashdex.viz.html import table as plain_table
 from flashdex.viz.library_cards import STATUS_CLASS, card_id
 from flashdex.viz.library_facts import (
     CODES,
@@ -77,6 +78,8 @@ th[aria-sort="descending"] button::after { content: " \\2193"; }
   margin: 8px 0; }
 .find input, .find select { font: inherit; padding: 3px 6px; }
 .find input { flex: 1 1 16em; max-width: 32em; }
+@media screen and (min-width: 761px) {
+  .codes td:last-child, .codes th:last-child { text-align: left; width: 60%; } }
 @media screen and (max-width: 760px) {
   .list thead { position: static; } .list tr { display: table-row; }
   .list td { display: table-cell; padding: 5px 6px;
@@ -115,14 +118,11 @@ def code_table(facts: Sequence[RecordingFacts]) -> Html:
     if not counts:
         return tag("p", "No recording was remarked on.", class_="soft")
     names = ["code", *reversed(STATUSES), "meaning"]
-    heads = [tag("th", n, class_="left" if n == "meaning" else "") for n in names]
     rows = []
     for code, by_status in counts.items():
         button = tag("button", code, type="button", class_="code", data_code=code)
-        cells = [tag("td", button), *(tag("td", n) for n in by_status.values())]
-        meaning = tag("td", CODES.get(code, ""), class_="left")
-        rows.append(tag("tr", *cells, meaning))
-    return tag("table", tag("thead", tag("tr", *heads)), tag("tbody", joined(rows)))
+        rows.append([button, *by_status.values(), CODES.get(code, "")])
+    return tag("div", plain_table(names, rows), class_="codes")
 
 
 def _row(one: RecordingFacts, columns: Sequence[str], *, has_card: bool) -> Html:

@@ -236,7 +236,8 @@ def test_missing_files_are_told_with_every_place(tmp_path):
         ({"posedirs": np.zeros((778, 3, 90))}, "posedirs has shape .* expected"),
         ({"shapedirs": None}, "lacks shapedirs"),
         ({"v_template": np.full((778, 3), np.nan)}, "v_template holds NaN"),
-        ({"weights": "none"}, "weights does not hold numbers"),
+        ({"weights": "none"}, r"weights has shape \(\), expected"),
+        ({"weights": np.full((778, 16), "x")}, "weights does not hold numbers"),
         ({"kintree_table": np.zeros((2, 16))}, "not the tree of MANO"),
     ],
 )

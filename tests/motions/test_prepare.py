@@ -116,13 +116,15 @@ def test_keypoints_reader_and_rejected_rows(tmp_path, cache):
     demo = procedural(0, kinds=["pick_box_right"])[0]
     write_recording(tmp_path / "in", "good", demo)
     broken = demo.keypoints["right"].copy()
-    broken[40] = np.nan
+    broken[40] = np.nan  # closed; a long one leaves nothing of use
+    write_recording(tmp_path / "in", "hole", demo, kp_right=broken)
+    broken[50:-40] = np.nan
     write_recording(tmp_path / "in", "holes", demo, kp_right=broken)
     (tmp_path / "in" / "segments.json").write_text(
         '[{"clip": "good", "start": 0, "end": 130}]'
     )
     read = read_keypoints(tmp_path / "in")
-    assert [d.name for d in read] == ["good_0_130", "holes"]
+    assert [d.name for d in read] == ["good_0_130", "hole", "holes"]
     np.testing.assert_allclose(
         read[0].palm["right"], demo.palm["right"][:130], atol=1e-4
     )

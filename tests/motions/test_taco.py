@@ -214,6 +214,12 @@ def test_pointers_are_told_when_listing(root, mano, file):
         TACO.list(SourceOptions(path=root, mano=mano))
 
 
+def test_other_folders_are_told(read, root, caplog):
+    (root / "Hand_Poses" / "__MACOSX" / "x").mkdir(parents=True)
+    assert read(root).name == layout.SEQUENCE
+    assert "__MACOSX" in caplog.text
+
+
 def test_mano_is_missed_when_listing(root, tmp_path):
     with pytest.raises(DemoError, match="MANO"):
         TACO.list(SourceOptions(path=root, mano=tmp_path / "nothing"))

@@ -107,4 +107,4 @@ def _place(tracks: dict[str, np.ndarray], held: list[DemoObject]) -> int | None:
         gaps = [t[start : start + frames, :3, 3] - p[:, :3] for t, p in known]
         if all(np.abs(gap).max() < SAME_PLACE for gap in gaps):
             places.append(start)
-    return 0
+    return places[0] if len(places) == 1 else None

@@ -1,10 +1,10 @@
 """Reads recordings given as hand keypoints and object poses, one .npz a recording.
 
 Keys: ``fps``, ``object`` (the mesh is ``meshes/<object>.obj`` beside the file),
-``obj_pose`` (T, 7) (several objects: N names and (T, N, 7)), and per recorded hand ``kp_left`` (T, 21, 3) and, if known,
-``palm_left`` (T, 7); right likewise. Metres, quaternions wxyz, z up. A
-``segments*.json`` beside the files (a list of clip, start, end; end excluded) cuts
-recordings into motions called ``<clip>_<start>_<end>``.
+``obj_pose`` (T, 7) (several objects: N names and (T, N, 7)), and per recorded hand
+``kp_left`` (T, 21, 3) and, if known, ``palm_left`` (T, 7); right likewise. Metres,
+quaternions wxyz, z up. A ``segments*.json`` beside the files (a list of clip, start,
+end; end excluded) cuts recordings into motions called ``<clip>_<start>_<end>``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
+from flashdex.motions.meshes import hull_vertices
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
@@ -97,9 +98,7 @@ def read_file(file: Path) -> HumanDemo:
     )
 
 
-def _read_palm(
-    data: dict, side: Side, keypoints: dict[Side, np.ndarray]
-) -> np.ndarray:
+def _read_palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.ndarray:
     stored, points = data.get(f"palm_{side}"), keypoints[side]
     if stored is not None:
         return stored.astype(np.float64)
@@ -175,7 +174,7 @@ def _support(demo: HumanDemo) -> float | None:
         demo.validate()
     except DemoError:
         return None  # each piece is validated on its own; some may be sound
-    vertices = [np.asarray(b.load_mesh().vertices) for b in demo.objects]
+    vertices = [hull_vertices(b.load_mesh()) for b in demo.objects]
     poses = [b.pose for b in demo.objects]
     height, found = estimate_support(poses, vertices, demo.fps)
     return height if found else None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import trimesh
 
-from flashdex.errors import DemoError
+from flashdex.errors import DemoError, MeshError
 from flashdex.motions.meshes import load_mesh
 
 SUFFIXES = (".obj", ".ply", ".stl", ".glb")
@@ -87,5 +87,14 @@ def mesh_in(folder: Path) -> Path | None:
 
 
 def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
-    """The mesh file itself, or its mesh made larger by ``scale``."""
-    return file if scale == 1.0 else load_mesh(file).apply_scale(scale)
+    """The mesh file itself, or its mesh made larger by ``scale``.
+
+    Raises:
+        DemoError: the mesh has to be scaled and cannot be read.
+    """
+    if scale == 1.0:
+        return file
+    try:
+        return load_mesh(file).apply_scale(scale)
+    except MeshError as error:
+        raise DemoError(str(error)) from error

@@ -90,7 +90,7 @@ def _frame_ids(file: Path, value: Any) -> np.ndarray:
             f"{file}: E_KEYS: mocap_frame_id_list is not a list of integers."
         ) from error
     whole = len(ids) >= 2 and ids[0] >= 0
-    if not whole or  np.ptp(ids) >= 2 * len(ids):
+    if not whole or np.median(np.diff(ids)) != 1 or np.ptp(ids) >= 2 * len(ids):
         raise DemoError(
             f"{file}: W_FPS: {len(ids)} mocap ids do not advance by one; expected "
             f"every frame at 120 Hz. Are these the ids of the images, at 30 Hz?"

@@ -1,68 +1,20 @@
-"""What a pickle from outside may build: stand-ins, made into values afterwards.
-
-No object of a library is ever handed to the pickle machine. Each allowed name is a
-class of this file that only keeps what it is given; ``to_value`` then builds plain
-values from checked sizes and indices. So no name can be called to an effect, and no
-class can be changed for the next file.
-"""
+"""Stand-ins for arrays of numpy and of chumpy."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-Value = Callable[[Any], Any]
+from flashdex.motions.stand_ins.base import StandIn, Value, check_sizes
 
-MAX_BYTES = 4 << 30  # of one array; more is a mistake or an attack
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
-
-
-class RefusedError(Exception):
-    """A pickle asks for something that is not data; the text is its name."""
-
-
-class StandIn:
-    """Keeps the arguments and the state that a pickle gives to an object."""
-
-    args: tuple
-    state: Any
-
-    def __new__(cls, *args: Any) -> StandIn:
-        """Keep the arguments here: pickles may skip ``__init__``."""
-        made = object.__new__(cls)
-        made.args, made.state = args, None
-        return made
-
-    # Every stand-in takes its state here: pickle would set attributes otherwise.
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-    def value(self, plain: Value) -> Any:
-        """The value this stands for; ``plain`` turns parts of it into values."""
-        raise ValueError(f"a bare {type(self).__name__} is not data")
-
-
-class ObjectType(StandIn):
-    """``object``, the base that old pickles name."""
 
 
 class ArrayType(StandIn):
     """``numpy.ndarray``, the class that ``_reconstruct`` names."""
-
-
-class Reconstructor(StandIn):
-    """``copyreg._reconstructor``: makes an empty object of an old pickle."""
-
-    def __new__(cls, *args: Any) -> StandIn:
-        """An empty object of the class that is asked for, if that is a stand-in."""
-        kind, base, state = args
-        if not issubclass(kind, StandIn) or base is not ObjectType or state is not None:
-            raise ValueError("an old-style object that is not plain")
-        return StandIn.__new__(kind)
 
 
 class Dtype(StandIn):
@@ -110,25 +62,22 @@ class Scalar(StandIn):
         return make_array((), plain(self.args[0]), "C", self.args[1], plain)[()]
 
 
-class Encoded(StandIn):
-    """``_codecs.encode``: how protocol 2 keeps bytes, as a latin-1 text."""
+class Chumpy(StandIn):
+    """``chumpy.ch.Ch``: an array with a history; only the array is wanted."""
 
-    def value(self, plain: Value) -> bytes:
-        """The bytes."""
-        text, codec = self.args
-        if codec not in ("latin1", "latin-1"):
-            raise ValueError(f"bytes in the encoding {codec!r}")
-        return plain(text).encode("latin1")
+    def value(self, plain: Value) -> np.ndarray:
+        """The array."""
+        return np.asarray(plain(self.state["x"]))
 
 
-class NoBytes(StandIn):
-    """``bytes`` as protocol 2 calls it: without arguments."""
+class ChumpySelect(StandIn):
+    """``chumpy.reordering.Select``: elements of an array, in a new shape."""
 
-    def value(self, plain: Value) -> bytes:
-        """No bytes."""
-        if self.args:
-            raise ValueError("bytes made of something")
-        return b""
+    def value(self, plain: Value) -> np.ndarray:
+        """The chosen elements."""
+        flat = np.asarray(plain(self.state["a"])).ravel()
+        places = np.asarray(plain(self.state["idxs"]), dtype=np.int64)
+        return flat[places].reshape(check_sizes(plain(self.state["preferred_shape"])))
 
 
 def make_array(
@@ -166,18 +115,3 @@ def make_array(
         return np.zeros(shape, dtype)
     flat = np.frombuffer(raw, dtype).astype(dtype.newbyteorder("="))
     return flat.reshape(shape, order=order)
-
-
-def check_sizes(sizes: Any) -> tuple[int, ...]:
-    """Sizes as a tuple of whole numbers from 0 up.
-
-    Raises:
-        ValueError: they are something else.
-    """
-    sizes = (sizes,) if isinstance(sizes, int) else sizes
-    if not isinstance(sizes, (tuple, list)):
-        raise ValueError(f"{sizes!r} are not sizes")
-    whole = [isinstance(n, (int, np.integer)) and 0 <= n <= MAX_BYTES for n in sizes]
-    if not all(whole) or len(sizes) > 32:
-        raise ValueError(f"{sizes!r} are not sizes")
-    return tuple(int(n) for n in sizes)

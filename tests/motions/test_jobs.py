@@ -1,0 +1,212 @@
+"""Jobs: what is done is not done again, and one bad recording costs only itself."""
+
+import os
+import signal
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from flashdex.errors import DemoError
+from flashdex.motions.jobs import Job, run_job
+from flashdex.motions.objects import ObjectSettings
+from flashdex.motions.pool import run_jobs
+from flashdex.motions.prepare import Order, hash_inputs, prepare, run_order
+from flashdex.motions.process import MotionSettings
+from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources import SOURCES, list_recordings
+from flashdex.motions.sources.procedural import procedural
+
+SMALL = ObjectSettings(sdf_resolution=24)
+
+
+@pytest.fixture
+def settings(tmp_path):
+    cache = tmp_path / "cache"
+    return MotionSettings(control_hz=15.0, objects=SMALL, attempts=1, cache_dir=cache)
+
+
+def too_short(name):
+    """A recording that is read and rejected in no time."""
+    demo = procedural(0, kinds=["pick_box_right"])[0]
+    return [demo.cut(0, 40, name=name)]
+
+
+def never():
+    raise AssertionError("the recording was read again")
+
+
+def die(code):
+    os.kill(os.getpid(), code)
+
+
+def stop():
+    raise KeyboardInterrupt
+
+
+def wrong_key():
+    return {}["no such key"]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    file = tmp_path / "clip.bin"
+    file.write_bytes(b"content")
+    return Recording(name="clip", read=partial(too_short, "clip"), files=(file,))
+
+
+def statuses(outcomes):
+    return [row["reason"].split(":")[0] for o in outcomes for row in o.rows]
+
+
+def test_prepared_motion_comes_from_the_disk_as_it_was(settings):
+    listed = list_recordings(
+        "procedural", SourceOptions(path="pick_box_right", limit=1)
+    )
+    first = run_job(Job(listed[0], settings))
+    again = run_job(Job(replace(listed[0], read=never), settings))
+    assert again.rows == first.rows
+    assert first.rows[0]["status"] != "rejected"
+    root = settings.cache_dir
+    (stored,), (made,) = again.load(root), first.load(root)
+    fresh = run_job(Job(listed[0], replace(settings, cache_dir=root / "other")))
+    (computed,) = fresh.load(root / "other")
+    for key, value in computed.record.frames.items():
+        np.testing.assert_array_equal(stored.record.frames[key], value)
+    assert stored.record.quality["contact"].any()
+    assert stored.record.info == made.record.info
+    assert stored.record.objects[0].name == computed.record.objects[0].name
+
+
+def test_changed_content_settings_or_lost_object_is_prepared_again(settings, recording):
+    run_job(Job(recording, settings))
+    unread = replace(recording, read=never)
+    assert statuses([run_job(Job(unread, settings))]) == ["R_SHORT"]
+    other = replace(settings, control_hz=30.0)
+    assert statuses([run_job(Job(unread, other))]) == ["E_READ"]
+    recording.files[0].write_bytes(b"another content")
+    assert statuses([run_job(Job(unread, settings))]) == ["E_READ"]
+
+
+def test_damaged_cache_file_is_replaced(settings, recording):
+    first = run_job(Job(recording, settings))
+    first.file.write_bytes(b"PK no archive")
+    again = run_job(Job(recording, settings))
+    assert again.rows == first.rows
+    assert again.file.read_bytes() != b"PK no archive"
+
+
+def test_cache_that_cannot_be_written_costs_nothing(settings, recording, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    settings = replace(settings, cache_dir=tmp_path / "file")
+    outcome = run_job(Job(recording, settings))
+    assert outcome.file is None or not outcome.file.is_file()
+    assert len(outcome.load(tmp_path)) == 1
+
+
+def test_bad_recordings_become_rows_and_the_others_go_on(settings, recording):
+    refused = Recording(name="refused", read=partial(DemoError.__init__))
+    odd = Recording(name="odd", read=wrong_key)
+    gone = Recording(name="gone", read=never, files=(recording.files[0] / "no",))
+    jobs = [Job(r, settings) for r in (refused, odd, gone, recording)]
+    outcomes = run_jobs(jobs, workers=1, progress=False)
+    assert statuses(outcomes) == ["E_READ", "E_READ", "E_FILE", "R_SHORT"]
+    assert "KeyError" in outcomes[1].rows[0]["reason"]
+
+
+def test_interrupted_work_goes_on_where_it_was(settings, recording):
+    stopped = Recording(name="second", read=stop)
+    jobs = [Job(recording, settings), Job(stopped, settings)]
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(jobs, workers=1, progress=False)
+    second = replace(stopped, read=partial(too_short, "second"))
+    jobs = [Job(replace(recording, read=never), settings), Job(second, settings)]
+    outcomes = run_jobs(jobs, workers=1, progress=False)
+    assert statuses(outcomes) == ["R_SHORT", "R_SHORT"]
+
+
+def test_worker_that_dies_costs_its_recording_only(settings, recording):
+    killed = Recording(name="killer", read=partial(die, signal.SIGKILL))
+    others = [
+        replace(recording, name=f"clip{i}", read=partial(too_short, f"clip{i}"))
+        for i in range(3)
+    ]
+    jobs = [Job(r, settings) for r in (others[0], killed, *others[1:])]
+    outcomes = run_jobs(jobs, workers=2, progress=False)
+    assert statuses(outcomes) == ["R_SHORT", "E_CRASH", "R_SHORT", "R_SHORT"]
+    assert [o.rows[0]["motion"] for o in outcomes] == [
+        *("clip0", "killer", "clip1", "clip2")
+    ]
+
+
+def test_two_workers_write_the_library_of_one(tmp_path):
+    made = []
+    for workers in (1, 2):
+        library = prepare(
+            "procedural",
+            "pick_box_right,pick_cylinder_left",
+            out=tmp_path / f"library{workers}",
+            control_hz=15.0,
+            objects=SMALL,
+            workers=workers,
+            cache_dir=tmp_path / f"cache{workers}",
+            progress=False,
+        )
+        made.append(library)
+    one, two = made
+    assert one.names == two.names
+    assert (one.frames == two.frames).all()
+    assert (one.objects == two.objects).all()
+    assert one.manifest["inputs"] == two.manifest["inputs"]
+
+
+def test_slow_playback_halves_the_speed(tmp_path):
+    lengths, speeds = [], []
+    for speed in (1.0, 0.5):
+        library = prepare(
+            "procedural",
+            "pick_box_right",
+            out=tmp_path / f"{speed}",
+            control_hz=15.0,
+            objects=SMALL,
+            cache_dir=tmp_path / "cache",
+            speed=speed,
+        )
+        lengths.append(int(library.motions["length"][0]))
+        speeds.append(float(library.frames["object_linvel"].norm(dim=-1).max()))
+    assert lengths[1] == pytest.approx(2 * lengths[0], abs=2)
+    assert speeds[1] == pytest.approx(0.5 * speeds[0], rel=0.2)
+
+
+def test_copies_are_reported_and_left_out(tmp_path, monkeypatch, settings):
+    for name in ("a", "b"):
+        (tmp_path / name).write_bytes(b"same")
+    names = ("a", "b", "box")
+    listed = [
+        Recording(name=n, read=partial(too_short, n), files=(tmp_path / n,))
+        for n in names[:2]
+    ]
+    listed += list_recordings("procedural", SourceOptions(path="pick_box_right"))
+    source = Source(list=lambda options: listed, about="test", needs=())
+    monkeypatch.setitem(SOURCES, "copies", source)
+    order = Order("copies", SourceOptions(), settings)
+    library = run_order(order, tmp_path / "library")
+    report = (library.path / "report.csv").read_text()
+    assert "I_DUP: the same content as 'a'" in report
+    assert library.manifest["quality"]["rejected"] == 2
+
+
+def test_inputs_hash_follows_content_not_place(tmp_path, monkeypatch, settings):
+    file = tmp_path / "a"
+    file.write_bytes(b"one")
+    listed = [Recording(name="a", read=never, files=(file,))]
+    source = Source(list=lambda options: listed, about="test", needs=())
+    monkeypatch.setitem(SOURCES, "hashed", source)
+    order = Order("hashed", SourceOptions(), settings)
+    first = hash_inputs(order)
+    assert hash_inputs(replace(order, settings=replace(settings, speed=0.5))) != first
+    file.write_bytes(b"two")
+    assert hash_inputs(order) != first
+    file.write_bytes(b"one")
+    assert hash_inputs(order) == first

@@ -6,6 +6,7 @@ hand (six wrist joints first), L links of a hand, O object slots, K future frame
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 Side = Literal["left", "right"]
@@ -64,3 +65,8 @@ def reward(side: Side) -> tuple[str, str]:
 def failed(side: Side) -> tuple[str, str]:
     """Key of the flag that blames one hand for the end of the episode, (N, 1)."""
     return (side, FAILED)
+
+
+def sides_of(by_side: Mapping[Side, object]) -> list[Side]:
+    """Hands that a mapping has, left first."""
+    return [side for side in SIDES if side in by_side]

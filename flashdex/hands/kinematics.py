@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from flashdex.geometry.rotation import quat_from_axis_angle, quat_mul, quat_rotate
 from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandError, HandSpec
-from flashdex.keys import SIDES, Side
+from flashdex.keys import Side, sides_of
 
 Pose = tuple[Tensor, Tensor]
 Twist = tuple[Tensor, Tensor]
@@ -28,7 +28,8 @@ class HandKinematics(nn.Module):
     in the world frame, which is the frame the wrist slides move in.
 
     Args:
-        specs: left and right hand of one embodiment, as returned by ``load_hand``.
+        specs: the hands of one embodiment, as returned by ``load_hand``; mostly both,
+            and where shapes say 2, as many as there are.
 
     Raises:
         HandError: the hands have different trees.
@@ -41,7 +42,7 @@ class HandKinematics(nn.Module):
         (torch.Size([512, 2, 5, 3]), torch.Size([512, 2, 13, 4]))
     """
 
-    # link arrays are stored by depth, base first, so that a level is a slice; H = 2
+    # link arrays are stored by depth, base first, so that a level is a slice; H hands
     link_pos: Tensor  # (H, L, 3)
     link_quat: Tensor  # (H, L, 4)
     link_axis: Tensor  # (H, L, 3), zero for a welded link
@@ -56,8 +57,8 @@ class HandKinematics(nn.Module):
 
     def __init__(self, specs: Mapping[Side, HandSpec]) -> None:
         super().__init__()
-        hands = [specs[side] for side in SIDES]
-        _refuse_different_trees(*hands)
+        hands = [specs[side] for side in sides_of(specs)]
+        _refuse_different_trees(hands[0], hands[-1])
         depth = compute_depth(hands[0].link_parent)
         order = np.argsort(depth, kind="stable")
         starts = np.flatnonzero(np.diff(depth[order], prepend=-1))

@@ -42,7 +42,7 @@ class Attempt:
 
     Args:
         joint_pos: hands without a part in it parked, m and rad, (T, 2, J).
-        tip_error: robot pad to human tip, m, (T, 2, 5).
+        tip_error: robot pad to human tip, m, (T, H, 5), hands that take part.
         depth: penetration by MuJoCo's collisions.
         score: m, less is better.
     """
@@ -78,19 +78,17 @@ def choose_attempt(
     sdf: SdfGrid,
     *,
     count: int,
-    active: np.ndarray,
     park: Callable[[np.ndarray], np.ndarray],
     measure: Callable[[np.ndarray], Penetration],
 ) -> Choice:
     """Solve up to ``count`` times and keep the best; a clean solution ends it.
 
     Args:
-        retargeter: of the hand.
-        targets: what the human hands and the objects do.
+        retargeter: of the H hands that take part.
+        targets: of the same hands.
         sdf: distance grids of the objects.
         count: most attempts.
-        active: hands that count, (2,).
-        park: moves hands that take no part out of the way.
+        park: adds the hands that take no part, (T, H, J) to (T, 2, J).
         measure: penetration of joint positions (T, 2, J).
     """
     attempts = []
@@ -98,10 +96,11 @@ def choose_attempt(
         result = retargeter.solve(targets, sdf, start=start)
         joint_pos = park(result.joint_pos)
         depth = measure(joint_pos)
-        errors = result.tip_error[:, active]
         deepest = float(depth.objects.max(initial=0.0))
-        jerk = np.abs(np.diff(joint_pos[:, active, 6:], n=2, axis=0)).max(initial=0.0)
-        score = float(errors.mean() + PENETRATION_SHARE * deepest + JERK_COST * jerk)
+        fingers = result.joint_pos[..., 6:]
+        jerk = np.abs(np.diff(fingers, n=2, axis=0)).max(initial=0.0)
+        score = float(result.tip_error.mean()) + PENETRATION_SHARE * deepest
+        score += JERK_COST * float(jerk)
         attempts.append(Attempt(joint_pos, result.tip_error, depth, score))
         if deepest < CLEAN_DEPTH and jerk < CLEAN_JERK:
             break

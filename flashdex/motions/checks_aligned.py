@@ -138,14 +138,13 @@ def check_retarget(
     joint_range: np.ndarray,
 ) -> tuple[list[Finding], dict[str, float]]:
     """Tip error, joint limits and penetration of the robot's reference."""
-    errors = tip_error[:, aligned.active]
-    mean, p95 = float(errors.mean()), float(np.quantile(errors, 0.95))
+    mean, p95 = float(tip_error.mean()), float(np.quantile(tip_error, 0.95))
     fingers, ranges = joint_pos[:, :, 6:], joint_range[:, 6:]
     edge = 0.005 * (ranges[..., 1] - ranges[..., 0])
     at_limit = (fingers < ranges[..., 0] + edge) | (fingers > ranges[..., 1] - edge)
     saturated = float(at_limit[:, aligned.active].mean())
     figures = {
-        "tip_error_median_mm": round(1e3 * float(np.median(errors)), 2),
+        "tip_error_median_mm": round(1e3 * float(np.median(tip_error)), 2),
         "tip_error_p95_mm": round(1e3 * p95, 2),
         "penetration_median_mm": round(1e3 * float(np.median(depth.objects)), 2),
         "penetration_p95_mm": round(1e3 * float(np.quantile(depth.objects, 0.95)), 2),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from flashdex.geometry.rotation import quat_from_axis_angle, quat_rotate
 from flashdex.hands.spec import HandSpec
-from flashdex.keys import SIDES, Side
+from flashdex.keys import Side, sides_of
 
 NUM_WRIST, NUM_SLIDES = 6, 3
 
@@ -83,7 +83,7 @@ class HandJacobian:
     """
 
     def __init__(self, specs: Mapping[Side, HandSpec]) -> None:
-        hands = [specs[side] for side in SIDES]
+        hands = [specs[side] for side in sides_of(specs)]
         self._axes = torch.tensor(np.stack([h.joint_axis for h in hands]))
         self._link = torch.tensor(np.maximum(hands[0].joint_link, 0))
         self._moves = torch.tensor(_moves(hands[0])).double()

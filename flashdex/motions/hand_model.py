@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from flashdex.hands.spec import HandSpec
-from flashdex.keys import SIDES, Side
+from flashdex.keys import Side, sides_of
 from flashdex.motions.hand_spheres import make_spheres
 
 # share of its range at which a relaxed finger joint rests
@@ -35,7 +35,7 @@ class HandModel:
     """
 
     def __init__(self, specs: Mapping[Side, HandSpec]) -> None:
-        hands = [specs[side] for side in SIDES]
+        hands = [specs[side] for side in sides_of(specs)]
         ranges = np.stack([h.joint_range for h in hands])
         self.low, self.high = torch.tensor(ranges[..., 0]), torch.tensor(ranges[..., 1])
         self.relaxed = self.low + RELAXED * (self.high - self.low)

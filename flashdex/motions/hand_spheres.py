@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from flashdex.hands.spec import HandSpec
-from flashdex.keys import SIDES, Side
+from flashdex.keys import Side, sides_of
 
 
 @dataclass
@@ -33,19 +33,20 @@ class HandSpheres:
 
 
 def make_spheres(specs: Mapping[Side, HandSpec]) -> HandSpheres:
-    """Spheres of both hands; capsules and boxes are filled, other geoms refused.
+    """Spheres of the hands; capsules and boxes are filled, other geoms refused.
 
     Args:
-        specs: left and right hand, as returned by ``load_hand``.
+        specs: one hand or both, as returned by ``load_hand``.
     """
-    models = [mujoco.MjSpec.from_string(specs[s].mjcf).compile() for s in SIDES]
+    sides = sides_of(specs)
+    models = [mujoco.MjSpec.from_string(specs[s].mjcf).compile() for s in sides]
     # both sides get as many spheres, though their sizes differ by fractions of a mm
     hands = [
         _spheres_of(specs[side], model, models[0].geom_size)
-        for side, model in zip(SIDES, models, strict=True)
+        for side, model in zip(sides, models, strict=True)
     ]
     links, _, radii = hands[0]
-    tips = {int(link): f for f, link in enumerate(specs["left"].tip_link)}
+    tips = {int(link): f for f, link in enumerate(specs[sides[0]].tip_link)}
     return HandSpheres(
         link=torch.tensor(links),
         pos=torch.tensor(np.stack([h[1] for h in hands])),

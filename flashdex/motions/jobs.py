@@ -88,7 +88,7 @@ def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Pr
         return [_reject(recording.name, code, str(error))]
     except Exception as error:  # what no check foresaw must not end the others
         logger.debug("%s", recording.name, exc_info=True)
-        text = f"not readable: {type(error).__name__}: {error}"
+        text = f"unforeseen {type(error).__name__}: {error}"
         return [_reject(recording.name, "E_READ", text)]
 
 

@@ -14,13 +14,14 @@ import torch
 from flashdex.errors import DemoError, MeshError
 from flashdex.geometry.rotation import quat_mul, quat_rotate
 from flashdex.hands.spec import HandSpec, load_hand
-from flashdex.keys import Side
+from flashdex.keys import SIDES, Side
 from flashdex.motions.align import AlignedDemo, align
 from flashdex.motions.attempts import Choice, choose_attempt
 from flashdex.motions.checks import Finding, check_demo, make_strict, status_of
 from flashdex.motions.checks_aligned import check_aligned, check_retarget
 from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
+from flashdex.motions.hand_model import HandModel
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.meshes import hull_vertices
@@ -157,16 +158,16 @@ def _retarget(
     specs: Mapping[Side, HandSpec],
     settings: MotionSettings,
 ) -> tuple[Choice, Targets]:
-    retargeter = Retargeter(specs, weights=settings.weights)
-    targets = make_targets(aligned, retargeter)
+    targets = make_targets(aligned, HandModel(specs))
     scene = make_reference_scene(specs, [a.parts for a in assets])
+    acting = np.flatnonzero(aligned.active)
+    used: dict[Side, HandSpec] = {SIDES[h]: specs[SIDES[h]] for h in acting}
     choice = choose_attempt(
-        retargeter,
-        targets,
+        Retargeter(used, weights=settings.weights),
+        targets.of(torch.tensor(acting)),
         make_slot_grid(assets, solid=True),
         count=settings.attempts,
-        active=aligned.active,
-        park=partial(_park, active=aligned.active),
+        park=partial(_park, acting=acting),
         measure=partial(
             measure_penetration, scene, poses=aligned.poses, active=aligned.active
         ),
@@ -204,25 +205,30 @@ def _record(
             "provenance": demo.provenance,
         },
         quality={
-            "tip_error": best.tip_error.astype(np.float32),
+            "tip_error": _both(best.tip_error, aligned.active),
             "penetration": best.depth.objects.astype(np.float32),
             "contact": aligned.contact,
         },
     )
 
 
-def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
+def _both(values: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Values of the hands that take part, zero for the others, (T, 2, ...)."""
+    out = np.zeros((len(values), 2, *values.shape[2:]), dtype=np.float32)
+    out[:, active] = values
+    return out
+
+
+def make_targets(aligned: AlignedDemo, hand: HandModel) -> Targets:
     """What the robot hands should reach in every frame.
 
     The base is placed so that the robot's middle knuckle meets the human one: the
     robot's palm is longer than a human's.
     """
     palm = torch.tensor(aligned.palm)
-    wrist_quat = quat_mul(
-        palm[..., 3:], retargeter.hand.wrist_from_palm.expand_as(palm[..., 3:])
-    )
+    wrist_quat = quat_mul(palm[..., 3:], hand.wrist_from_palm.expand_as(palm[..., 3:]))
     keypoints = torch.tensor(aligned.keypoints)
-    arm = quat_rotate(wrist_quat, retargeter.hand.knuckle.expand(*palm.shape[:-1], 3))
+    arm = quat_rotate(wrist_quat, hand.knuckle.expand(*palm.shape[:-1], 3))
     poses = torch.tensor(np.stack(aligned.poses, axis=1))
     normal = torch.tensor([0.0, 0.0, 1.0], dtype=palm.dtype)
     weight = np.stack([blend(aligned.contact[:, h]) for h in range(2)], axis=1)
@@ -238,12 +244,12 @@ def make_targets(aligned: AlignedDemo, retargeter: Retargeter) -> Targets:
     )
 
 
-def _park(joint_pos: np.ndarray, *, active: np.ndarray) -> np.ndarray:
-    joint_pos = joint_pos.copy()
-    for hand in np.flatnonzero(~active):
-        joint_pos[:, hand] = 0.0
-        joint_pos[:, hand, :3] = PARKED[hand]
-    return joint_pos
+def _park(joint_pos: np.ndarray, *, acting: np.ndarray) -> np.ndarray:
+    """Both hands (T, 2, J) from the acting ones (T, H, J); the other one rests."""
+    both = np.zeros((len(joint_pos), 2, joint_pos.shape[-1]))
+    both[..., :3] = PARKED
+    both[:, acting] = joint_pos
+    return both
 
 
 def make_frames(

@@ -5,7 +5,7 @@ A residual of 1 is one standard deviation of its ``RetargetWeights`` entry.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.ndimage import gaussian_filter1d
@@ -90,6 +90,22 @@ class Targets:
     object_pos: Tensor
     object_quat: Tensor
     palm_normal: Tensor
+
+    def of(self, hands: Tensor) -> Targets:
+        """The targets of some hands only.
+
+        Args:
+            hands: rows of the hand axis, int64.
+        """
+        return replace(
+            self,
+            tips=self.tips[:, hands],
+            wrist_pos=self.wrist_pos[:, hands],
+            wrist_quat=self.wrist_quat[:, hands],
+            contact=self.contact[:, hands],
+            hand_object=self.hand_object[hands],
+            palm_normal=self.palm_normal[:, hands],
+        )
 
 
 class Residuals:
@@ -201,7 +217,9 @@ class Residuals:
         gap = spheres.radius + weights.margin - touch * (weights.margin + weights.depth)
         parts = []
         for slot in range(self.targets.object_pos.shape[1]):
-            distance, slope = self._query(world, torch.full((2,), slot))
+            distance, slope = self._query(
+                world, torch.full_like(self.targets.hand_object, slot)
+            )
             depth = gap - distance
             hit = (depth > 0).to(depth.dtype) / weights.clear
             jac = frames.along(world, slope, spheres.link)

@@ -76,7 +76,8 @@ class Retargeter:
     """Solves joint references for one embodiment.
 
     Args:
-        specs: left and right hand, as returned by ``load_hand``.
+        specs: the hands to solve for, as returned by ``load_hand``; one or both, and
+            where shapes say 2, as many.
         weights: of the residuals.
 
     Example:
@@ -119,7 +120,7 @@ class Retargeter:
             low, high = self.hand.low[:, 6:], self.hand.high[:, 6:]
             q[..., 6:] = low + start.curl * (high - low)
         q[..., :3] = targets.wrist_pos + start.shift(targets.palm_normal)
-        for hand in range(2):
+        for hand in range(q.shape[1]):
             quats = targets.wrist_quat[:, hand].numpy()
             q[:, hand, 3:6] = torch.tensor(unwrap_wrist(quats))
         return q.clamp(self.hand.low, self.hand.high)

@@ -174,9 +174,9 @@ def test_slow_playback_halves_the_speed(tmp_path):
             speed=speed,
         )
         lengths.append(int(library.motions["length"][0]))
-        speeds.append(float(library.frames["object_linvel"].norm(dim=-1).max()))
+        speeds.append(library.frames["object_linvel"].norm(dim=-1).mean())
     assert lengths[1] == pytest.approx(2 * lengths[0], abs=2)
-    assert speeds[1] == pytest.approx(0.5 * speeds[0], rel=0.2)
+    assert float(speeds[1] / speeds[0]) == pytest.approx(0.5, rel=0.1)
 
 
 def test_copies_are_reported_and_left_out(tmp_path, monkeypatch, settings):

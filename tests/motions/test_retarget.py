@@ -101,7 +101,7 @@ def solved(specs, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     asset = make_object(aligned.meshes[0], settings=settings, cache_dir=cache)
     retargeter = Retargeter(specs)
-    targets = make_targets(aligned, retargeter)
+    targets = make_targets(aligned, retargeter.hand)
     result = retargeter.solve(targets, make_slot_grid([asset], solid=True))
     return aligned, asset, targets, result
 

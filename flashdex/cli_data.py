@@ -109,6 +109,8 @@ def _list_recordings(args: argparse.Namespace) -> int:
     recordings = list_recordings(args.source, options)
     for recording in recordings:
         size = sum(file.stat().st_size for file in recording.files)
-        print(f"{recording.name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
+        # a name must neither steer the terminal nor be half a character
+        name = "".join(c if c.isprintable() else "?" for c in recording.name)
+        print(f"{name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
     print(f"{len(recordings)} recordings")
     return 0

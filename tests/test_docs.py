@@ -179,10 +179,46 @@ def test_data_page_names_exactly_the_frame_entries():
 
 
 def test_data_page_names_exactly_the_codes_of_a_report():
-    code = re.compile(r'"([ERW]_[A-Z]+)"')
-    files = [ROOT / "flashdex/motions" / f for f in ("checks.py", "process.py")]
+    from flashdex.viz.library_facts import CODES
+
+    code = re.compile(r"\b[EIRW]_[A-Z]{2,}\b")
+    files = (ROOT / "flashdex/motions").rglob("*.py")
     written = {name for file in files for name in code.findall(file.read_text())}
     assert written == first_cells("data.md", "Codes")
+    assert written <= set(CODES)  # the report says what they mean
+
+
+def test_data_page_names_exactly_the_quality_entries():
+    from flashdex.motions.library import QUALITY_KEYS
+
+    assert set(QUALITY_KEYS) == first_cells("data.md", "quality")
+
+
+def test_data_pages_name_every_source():
+    from flashdex.motions.sources import SOURCES
+
+    (row,) = re.findall(r"^\| `--source` .*", (DOCS / "data.md").read_text(), re.M)
+    assert set(re.findall(r"`([a-z]\w+)`", row)) == set(SOURCES)
+    page = (DOCS / "datasets.md").read_text()
+    assert set(SOURCES) - set(re.findall(r"^## (\w+)$", page, re.M)) == {"procedural"}
+
+
+def test_dataset_page_shows_commands_that_parse():
+    page = (DOCS / "datasets.md").read_text().replace("\\\n", " ")
+    commands = re.findall(r"^flashdex (.+)$", page, re.M)
+    assert len(commands) > 10
+    for command in commands:
+        args = make_parser().parse_args(command.split())
+        if args.verb == "prepare":
+            missing = [n for n in needs_of(args.source) if getattr(args, n) is None]
+            assert not missing, command
+
+
+def needs_of(source):
+    """Options of prepare that a source needs."""
+    from flashdex.motions.sources import SOURCES
+
+    return ["input" if name == "path" else name for name in SOURCES[source].needs]
 
 
 def test_data_page_names_exactly_the_columns_of_a_report(tmp_path):

@@ -68,7 +68,7 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
     out = out or myodm_dir()
     if _is_complete(out):
         return out
-    if out.exists() and any(out.iterdir()):
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DemoError(f"{out} holds other files; give an empty folder with --out.")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

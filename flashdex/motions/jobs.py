@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flashdex.errors import DemoError, MeshError
+from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions.checks import MAX_SECONDS, Finding, concerning
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
@@ -22,6 +22,8 @@ from flashdex.motions.repair import repair
 from flashdex.motions.segment import segment
 
 logger = logging.getLogger(__name__)
+
+WARNINGS = ("W_", "E_")  # a reader that goes on after an error has repaired it
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,17 @@ class Outcome:
 
         Args:
             root: of the cache.
+
+        Raises:
+            LibraryError: they were kept on the disk and are gone.
         """
         stored = None if self.file is None else read_prepared(self.file, root)
+        if stored is None and len(self.prepared) < len(self.rows):
+            raise LibraryError(
+                f"{self.file}: what a worker kept here cannot be read any more. All "
+                f"workers need the same cache folder, and nobody may clean it "
+                f"meanwhile. Start again: what is there is not prepared again."
+            )
         return self.prepared if stored is None else stored
 
 
@@ -69,8 +80,9 @@ def run_job(job: Job) -> Outcome:
         prepared = prepare_recording(job.recording, job.settings)
         write_prepared(file, prepared)
     rows = [item.row for item in prepared]
-    # a disk that refuses the cache must not cost the motions
-    return Outcome(rows, file, [] if file.is_file() else prepared)
+    # a disk that refuses the motions or their objects must not cost them
+    is_kept = read_prepared(file, root) is not None
+    return Outcome(rows, file, [] if is_kept else prepared)
 
 
 def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
@@ -117,7 +129,7 @@ def _notes(demo: HumanDemo) -> list[Finding]:
     found = []
     for note in demo.provenance.get("notes", []):
         code, _, text = str(note).partition(": ")
-        found.append(Finding(code, "warn" if code[:2] == "W_" else "info", text))
+        found.append(Finding(code, "warn" if code[:2] in WARNINGS else "info", text))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from flashdex.keys import FINGERS, SIDES
 from flashdex.motions.library import FRAME_KEYS, QUALITY_KEYS, SCHEMA
 from flashdex.motions.objects import ObjectAsset
 
+# what is no part of the name of a folder, and how long one may be
+NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
 CONVENTIONS = {
     "units": {"length": "m", "angle": "rad", "time": "s", "mass": "kg"},
     "up": "z",
@@ -134,6 +137,8 @@ class LibraryWriter:
             "motions": self._stack_motions(),
             "objects": _stack_objects(list(self._objects.values())),
         }
+        if all(r.quality for r in self._records):
+            tables["quality"] = self._stack_quality()
         # Writing to a mapped file on a full disk kills the process: ask beforehand.
         needed = sum(table.bytes() for table in tables.values())
         free = shutil.disk_usage(work).free
@@ -141,8 +146,6 @@ class LibraryWriter:
             raise OSError(
                 errno.ENOSPC, f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
             )
-        if all(r.quality for r in self._records):
-            tables["quality"] = self._stack_quality()
         for name, table in tables.items():
             table.memmap(str(work / name))
         manifest = self._manifest | {
@@ -152,7 +155,9 @@ class LibraryWriter:
                 for n, a, f in zip(names, self._objects.values(), files, strict=True)
             ],
         }
-        (work / "report.csv").write_text(report, encoding="utf-8")
+        # names of files and texts in them may hold what is no character
+        told = report.encode("utf-8", errors="backslashreplace")
+        (work / "report.csv").write_bytes(told)
         text = json.dumps(manifest, indent=1)
         (work / "manifest.json").write_text(text, encoding="utf-8")
 
@@ -211,12 +216,16 @@ def _stack_objects(assets: list[ObjectAsset]) -> TensorDict:
 
 
 def _unique_names(assets: list[ObjectAsset]) -> list[str]:
-    seen: dict[str, int] = {}
-    names = []
+    """Names of folders: a dataset may call its objects anything, "../x" as well."""
+    names: dict[str, None] = {}
     for asset in assets:
-        count = seen[asset.name] = seen.get(asset.name, 0) + 1
-        names.append(asset.name if count == 1 else f"{asset.name}_{count}")
-    return names
+        plain = NO_NAME.sub("_", asset.name).lstrip(".")[:NAME_LENGTH] or "object"
+        name, count = plain, 1
+        while name in names:
+            count += 1
+            name = f"{plain}_{count}"
+        names[name] = None
+    return list(names)
 
 
 def _write_meshes(work: Path, name: str, asset: ObjectAsset) -> dict[str, Any]:

@@ -16,16 +16,19 @@ from flashdex.geometry.points import farthest_point_sampling
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
 MIN_PART_AREA = 0.01  # share of the area below which a loose component is dropped
+# others of trimesh unpack archives, or read what they name from other files
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
+MAX_FACES = 5_000_000  # a scene may hold the same geometry any number of times
 SAMPLES_PER_POINT = 64  # density of the sample that farthest points are chosen from
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh:
-    """Read one mesh from any file trimesh reads.
+    """Read one mesh of one file.
 
     Scenes become one mesh, each geometry moved by the transform of its node.
 
     Args:
-        path: mesh file; its unit is taken to be the metre.
+        path: mesh file (``MESH_SUFFIXES``); its unit is taken to be the metre.
 
     Returns:
         The mesh as stored, not cleaned.
@@ -35,15 +38,27 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     """
     if not path.is_file():
         raise MeshError(f"{path}: mesh file not found. Check the path in the source.")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise MeshError(
+            f"{path}: not a mesh that is read. Allowed: {', '.join(MESH_SUFFIXES)}."
+        )
     try:
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
+        _refuse_large(scene)
         mesh = scene.to_mesh()
     except Exception as error:  # each reader of trimesh fails in its own way
         raise MeshError(
             f"{path}: not readable as a mesh ({error}). "
-            "Allowed: obj, ply, stl, glb and other formats of trimesh."
+            f"Allowed: {', '.join(MESH_SUFFIXES)}."
         ) from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def _refuse_large(scene: trimesh.Scene) -> None:
+    shapes = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
+    faces = sum(len(getattr(scene.geometry[s], "faces", ())) for s in shapes)
+    if faces > MAX_FACES:
+        raise ValueError(f"{faces} triangles; at most {MAX_FACES}")
 
 
 def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:

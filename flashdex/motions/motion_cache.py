@@ -28,7 +28,9 @@ from flashdex.motions.recording import Recording
 
 logger = logging.getLogger(__name__)
 
-CODE = ("motions", "hands", "geometry")  # parts of the package that decide the result
+# parts of the package that decide the result: their code, and models of the hands
+CODE = ("motions", "hands", "geometry", "keys.py")
+CODE_SUFFIXES = (".py", ".xml")
 LIBRARIES = ("numpy", "scipy", "torch", "mujoco", "trimesh", "coacd")
 
 
@@ -63,9 +65,10 @@ def _code_hash() -> str:
     """Of the code and the libraries that prepare: a changed line is another result."""
     root = Path(flashdex.__file__).parent
     digest = hashlib.sha256()
-    for part in CODE:
-        for file in sorted((root / part).rglob("*.py")):
-            digest.update(file.read_bytes())
+    for part in (root / name for name in CODE):
+        for file in sorted(part.rglob("*")) if part.is_dir() else [part]:
+            if file.suffix in CODE_SUFFIXES:
+                digest.update(file.read_bytes())
     digest.update(" ".join(version(name) for name in LIBRARIES).encode())
     return digest.hexdigest()
 

@@ -146,12 +146,7 @@ def make_object(
             if values is None:
                 values = _compute(mesh, settings, where)
                 write_cache(file, values)
-    if not values["watertight"]:
-        logger.warning(
-            "%s: the mesh is not watertight; volume, mass and inertia come from its "
-            "convex parts",
-            where,
-        )
+                _tell_open(where, is_watertight=values["watertight"])
     return ObjectAsset(name=name or "object", sha256=key, **values)
 
 
@@ -183,6 +178,15 @@ def _fingerprint(mesh: trimesh.Trimesh, settings: ObjectSettings) -> str:
     text = json.dumps([CACHE_VERSION, asdict(settings)], sort_keys=True)
     digest.update(text.encode())
     return digest.hexdigest()
+
+
+def _tell_open(where: str, *, is_watertight: bool) -> None:
+    if not is_watertight:
+        logger.warning(
+            "%s: the mesh is not watertight; volume, mass and inertia come from its "
+            "convex parts",
+            where,
+        )
 
 
 def _compute(mesh: trimesh.Trimesh, settings: ObjectSettings, where: str) -> Values:

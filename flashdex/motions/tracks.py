@@ -43,22 +43,23 @@ def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
         side: of the hand.
 
     Returns:
-        Wrist position and quaternion wxyz, (T, 7), NaN in the same frames.
+        Wrist position and quaternion wxyz, (T, 7), NaN in the same frames, and where
+        the points span no palm: zeros stand for a missing hand in many files.
     """
-    seen = np.isfinite(keypoints).all(axis=(1, 2))
-    if not seen.all():
-        out = np.full((len(keypoints), 7), np.nan)
-        if seen.any():
-            out[seen] = palm_frame(keypoints[seen], side)
-        return out
-    wrist, index, middle, pinky = (keypoints[:, i] for i in (0, 5, 9, 17))
+    pose = np.full((len(keypoints), 7), np.nan)
+    seen = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
+    points = np.where(seen[:, None, None], keypoints, np.nan)
+    wrist, index, middle, pinky = (points[:, i] for i in (0, 5, 9, 17))
     x = _unit(middle - wrist)
     normal = np.cross(index - wrist, pinky - wrist)
     normal = normal if side == "right" else -normal
     z = _unit(normal - np.sum(normal * x, -1, keepdims=True) * x)
     matrix = np.stack([x, np.cross(z, x), z], axis=-1)
-    quats = continuous(to_quat(Rotation.from_matrix(matrix)))
-    return np.concatenate([wrist, quats], axis=-1)
+    seen[seen] = np.linalg.det(matrix[seen]) > 0.5
+    if seen.any():
+        pose[seen, :3] = wrist[seen]
+        pose[seen, 3:] = continuous(to_quat(Rotation.from_matrix(matrix[seen])))
+    return pose
 
 
 def sample_times(num_frames: int, fps: float, target_fps: float) -> np.ndarray:

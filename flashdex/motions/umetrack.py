@@ -144,7 +144,7 @@ def _read_model(file: Path) -> dict[str, Any]:
             f"{file}: not found. It holds the hand's bones, which are needed without "
             f"MANO. Download the hand data of the sequence, or give --mano."
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DemoError(
             f"{file}: not a hand profile ({error!r}). Expected JSON with 'hand_model'."
         ) from error

@@ -12,7 +12,7 @@ import io
 import math
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import IO, Any
 
@@ -98,13 +98,38 @@ def load_object_array(path: Path) -> Any:
     return _guard(path, ".npy array", lambda file: _read_array(file, size))
 
 
-def load_npz(path: Path) -> dict[str, Any]:
+def load_npz(path: Path, *, only: Collection[str] | None = None) -> dict[str, Any]:
     """The entries of a ``.npz`` file, each as ``load_object_array`` gives it.
+
+    Args:
+        path: the file.
+        only: names of the entries that are wanted, as far as they are there.
 
     Raises:
         DemoError: as ``load_pickle``, or an entry announces more than 4 GiB.
     """
-    return _guard(path, ".npz archive", _read_npz)
+    return _guard(path, ".npz archive", lambda file: _read_npz(file, only))
+
+
+def load_arrays(
+    path: Path, *, only: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """The entries of a ``.npz`` file of plain arrays.
+
+    Args:
+        path: the file.
+        only: names of the entries that are wanted, as far as they are there.
+
+    Raises:
+        DemoError: as ``load_npz``, or an entry holds objects.
+    """
+    entries = _guard(path, ".npz without pickles", lambda file: _read_npz(file, only))
+    for name, array in entries.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind == "O":
+            raise DemoError(
+                f"{path}: not a readable .npz without pickles: '{name}' holds objects."
+            )
+    return entries
 
 
 def load_torch(path: Path) -> Any:
@@ -221,7 +246,7 @@ def _read_array(file: IO[bytes], size: int) -> Any:
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
-def _read_npz(file: IO[bytes]) -> dict[str, Any]:
+def _read_npz(file: IO[bytes], only: Collection[str] | None = None) -> dict[str, Any]:
     with zipfile.ZipFile(file) as archive:
         members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
         _check_size(members)
@@ -229,8 +254,10 @@ def _read_npz(file: IO[bytes]) -> dict[str, Any]:
             raise ValueError("it holds no .npy entries")
         entries = {}
         for member in members:
-            data = io.BytesIO(archive.read(member))
             name = member.filename.removesuffix(".npy")
+            if only is not None and name not in only:
+                continue
+            data = io.BytesIO(archive.read(member))
             entries[name] = _read_array(data, member.file_size)
         return entries
 

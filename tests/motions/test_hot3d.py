@@ -188,7 +188,7 @@ def test_an_object_without_model_is_told(tmp_path, scene):
     assert [body.name for body in demo.objects] == ["box", "block"]
     assert demo.provenance["missing_meshes"] == ["coffee_pot"]
     assert demo.provenance["most_moved"]["object"] == "coffee_pot"
-    assert "'coffee_pot' moves most" in demo.provenance["note"]
+    assert "'coffee_pot' moves most" in demo.provenance["notes"][0]
 
 
 @pytest.mark.parametrize("group", ["train", "hot3d_dataset/test"])
@@ -235,7 +235,7 @@ def test_real_samples(samples):
             np.testing.assert_allclose(bones, length, atol=5e-5)
     missing = ["coffee_pot", "mug_white", "puzzle_toy"]
     assert aria.provenance["missing_meshes"] == missing
-    assert "'coffee_pot' moves most" in aria.provenance["note"]
+    assert "'coffee_pot' moves most" in aria.provenance["notes"][0]
     assert aria.provenance["absent_masks"] == ["object_pose_quality", "qa_pass"]
     assert quest.provenance["most_moved"] == {"object": "mouse", "m": 0.0344}
 

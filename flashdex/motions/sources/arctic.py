@@ -209,7 +209,10 @@ def _read_splits(file: Path, *, given: Path | None) -> dict[str, str]:
     try:
         protocol = json.loads(file.read_text(encoding="utf-8"))
         return {str(n): str(s) for s, names in protocol.items() for n in names}
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (
+        *(OSError, ValueError, AttributeError),
+        *(TypeError, RecursionError),
+    ) as error:
         raise DemoError(
             f"{file}: expected a JSON object of splits, each a list of "
             f"<subject>/<sequence>, as in splits_json/protocol_p1.json: {error}"

@@ -9,7 +9,6 @@ A clip holds per hand (s = left, right) ``mano_{s}_joints`` (T, 20, 3), named
 
 from __future__ import annotations
 
-import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -124,11 +123,10 @@ def _ids(clip: Path) -> list[str]:
     """Objects that a clip names; none where it cannot be read (reading tells why)."""
     names = [f"obj_{side}_id" for side in SIDES] + ["desk_context_ids"]
     try:
-        with np.load(clip, allow_pickle=False) as stored:
-            arrays = [np.atleast_1d(stored[n]) for n in names if n in stored.files]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        arrays = load_npz(clip, only=names).values()
+    except DemoError:
         return []
-    return sorted({str(name) for array in arrays for name in array})
+    return sorted({str(name) for array in arrays for name in np.atleast_1d(array)})
 
 
 def _existing(names: list[str], folders: tuple[Path, ...]) -> tuple[Path, ...]:
@@ -137,7 +135,7 @@ def _existing(names: list[str], folders: tuple[Path, ...]) -> tuple[Path, ...]:
     for name in names:
         try:
             found.append(seek_mesh(name, folders))
-        except DemoError:
+        except (DemoError, OSError):
             continue
     return tuple(file for file in found if file is not None)
 

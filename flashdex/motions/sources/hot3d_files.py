@@ -20,6 +20,11 @@ POSE_HEADER = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m]"
 POSE_COLUMNS = (*POSE_HEADER.split(","), "q_wo_w", "q_wo_x", "q_wo_y", "q_wo_z")
 MASK_COLUMNS = ("timestamp[ns]", "stream_id", "mask")
 HAND_IDS: dict[str, Side] = {"0": "left", "1": "right"}
+# what JSON of another layout, or nested too deep, raises
+BROKEN_JSON = (
+    *(ValueError, KeyError, TypeError, AttributeError),
+    *(OverflowError, RecursionError),
+)
 WRIST = 7  # first columns of a hand's row: position, quaternion wxyz
 
 
@@ -130,7 +135,7 @@ def _cells(file: Path, line: int) -> Iterator[None]:
     """Turns what a malformed row raises into one message with its line."""
     try:
         yield
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except BROKEN_JSON as error:
         raise DemoError(
             f"{file}, line {line}: not a row of this file: {error!r}. Download the "
             f"file again."

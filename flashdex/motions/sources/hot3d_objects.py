@@ -11,7 +11,7 @@ import numpy as np
 
 from flashdex.errors import DemoError
 from flashdex.motions.demo import DemoObject
-from flashdex.motions.sources.hot3d_files import Track, read_lines
+from flashdex.motions.sources.hot3d_files import BROKEN_JSON, Track, read_lines
 from flashdex.motions.sources.hot3d_time import FrameAxis
 from flashdex.motions.sources.roots import refuse_pointer
 
@@ -42,7 +42,7 @@ class ObjectLibrary:
         try:
             found = json.loads("\n".join(read_lines(file)))
             return {uid: str(body["instance_name"]) for uid, body in found.items()}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except BROKEN_JSON as error:
             raise DemoError(
                 f"{file}: expected {{uid: {{instance_name: ...}}}}: {error!r}"
             ) from error
@@ -147,8 +147,9 @@ def _describe(moved: dict[str, float], missing: list[str]) -> dict[str, Any]:
     if missing:
         notes["missing_meshes"] = sorted(missing)
     if most in missing:
-        notes["note"] = (
+        text = (
             f"'{most}' moves most ({moved[most] * 1e3:.0f} mm) but has no model: what "
             f"is done with it is lost. Add its .glb to the object library."
         )
+        notes["notes"] = [f"E_MESH: {text}"]
     return notes

@@ -22,6 +22,7 @@ COLOUR_STREAM = "214-1"
 MERGE = 10_000_000  # ns; stamps closer than this are one frame
 JOIN = 5_000_000  # ns; a row further from a frame than this does not belong to it
 SECOND = 1e9
+MAX_SECONDS = 4 * 3600  # no session is longer: one wrong stamp would make it years
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,11 @@ def frame_axis(name: str, tracks: Iterable[Track], mask: Mask | None) -> FrameAx
             f"{name}: {len(kept)} frames in dynamic_objects.csv; a motion needs more."
         )
     steps = np.diff(kept)
+    if (seconds := (kept[-1] - kept[0]) / SECOND) > MAX_SECONDS:
+        raise DemoError(
+            f"{name}: W_GAP: its stamps span {seconds:.0f} s, the longest step "
+            f"{steps.max() / SECOND:.0f} s. One is wrong; download the file again."
+        )
     fps = float(SECOND / np.median(steps))
     if abs(fps / FPS - 1) > RATE_TOLERANCE:
         raise DemoError(

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.motions.sources.hot3d_files import read_lines
+from flashdex.motions.sources.hot3d_files import BROKEN_JSON, read_lines
 
 Up = Literal["z", "y"]
 # Aria: origin near the first headset position; Quest: origin on the floor
@@ -57,7 +57,7 @@ def read_metadata(file: Path) -> Metadata:
             names={str(u): str(n) for u, n in zip(uids, names, strict=False)},
             version=next((str(v) for k, v in data.items() if "version" in k), ""),
         )
-    except (ValueError, AttributeError, TypeError) as error:
+    except BROKEN_JSON as error:
         raise DemoError(
             f"{file}: not the metadata of a HOT3D sequence: {error!r}. Expected JSON "
             f"with 'headset' and 'participant_id'."

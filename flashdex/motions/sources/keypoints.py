@@ -10,7 +10,6 @@ end; end excluded) cuts recordings into motions called ``<clip>_<start>_<end>``.
 from __future__ import annotations
 
 import json
-import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from flashdex.motions.meshes import hull_vertices
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
+from flashdex.motions.unpickle import load_arrays
 
 REQUIRED = ("fps", "object", "obj_pose")
 SOURCE = "keypoints"
@@ -70,13 +70,7 @@ def read_keypoints(path: str | Path) -> list[HumanDemo]:
 
 def read_file(file: Path) -> HumanDemo:
     """One recording, uncut."""
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            data = {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DemoError(
-            f"{file}: not a readable .npz without pickles: {error}"
-        ) from error
+    data = load_arrays(file)
     missing = [key for key in REQUIRED if key not in data]
     hands: list[Side] = [side for side in SIDES if f"kp_{side}" in data]
     if missing or not hands:
@@ -133,12 +127,11 @@ def _mesh_file(file: Path, name: str) -> Path:
 def _mesh_files(file: Path) -> tuple[Path, ...]:
     """Meshes that a recording names; none where it cannot be read (yet)."""
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            names = [str(name) for name in np.atleast_1d(stored["object"])]
-        meshes = [_mesh_file(file, name) for name in names]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, DemoError):
+        names = np.atleast_1d(load_arrays(file, only=["object"])["object"])
+        meshes = [_mesh_file(file, str(name)) for name in names]
+        return tuple(mesh for mesh in meshes if mesh.is_file())
+    except (OSError, KeyError, DemoError):
         return ()
-    return tuple(mesh for mesh in meshes if mesh.is_file())
 
 
 def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
@@ -150,7 +143,7 @@ def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
             for row in rows:
                 span = (int(row["start"]), int(row["end"]))
                 pieces.setdefault(str(row["clip"]), []).append(span)
-        except (ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise DemoError(
                 f"{file}: expected a list of {{clip, start, end}}: {error!r}"
             ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def read_objects(
             raise DemoError(f"{file}: qpos_obj_{side} {stored.shape}; expected (T, 7).")
         pose = pose_track(stored, f"{file}: qpos_obj_{side}")
         mesh = _mesh(file, str(folder), objects)
-        twin = any(b.mesh == mesh and np.allclose(b.pose, pose) for _, b in bodies)
+        twin = any(b.mesh == mesh and _same_track(b.pose, pose) for _, b in bodies)
         # arcticv2 names the right hand's mesh on both sides; a side of zeros is empty
         if not twin and np.abs(stored[:, :3]).max(initial=0.0) > 0:
             bodies.append((side, DemoObject(_tail(str(folder)), mesh, pose)))
@@ -41,6 +42,10 @@ def read_objects(
             f"found: {', '.join(map(str, info)) or 'no such file'}."
         )
     return bodies
+
+
+def _same_track(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, equal_nan=True)
 
 
 def hand_object(
@@ -87,7 +92,7 @@ def task_info(file: Path) -> tuple[dict[str, Any], Path | None]:
             continue
         try:
             info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DemoError(f"{folder / INFO}: not readable JSON: {error}") from error
         if not isinstance(info, dict):
             raise DemoError(f"{folder / INFO}: expected a JSON object.")
@@ -99,8 +104,11 @@ def known_files(file: Path, objects: Path | None) -> tuple[Path, ...]:
     """Info and meshes as far as they are found; reading tells what is missing."""
     try:
         info, info_file = task_info(file)
-        dirs = [info.get(f"{side}_object_mesh_dir") for side in SIDES]
-        meshes = {_mesh(file, str(d), objects) for d in dirs if d}
     except DemoError:
         return ()
+    meshes = set()
+    for side in SIDES:
+        with suppress(DemoError, OSError):  # one side may have no mesh and need none
+            if folder := info.get(f"{side}_object_mesh_dir"):
+                meshes.add(_mesh(file, str(folder), objects))
     return (*([info_file] if info_file else []), *sorted(meshes))

@@ -20,6 +20,8 @@ Status = Literal["kept", "flagged", "rejected"]
 MIN_SECONDS, MAX_SECONDS = 1.0, 20.0
 JUMP_EVENTS = 5
 PALM_LENGTH = (0.06, 0.12)  # m, wrist to middle MCP
+TRAVEL = (1.5, 3.0)  # m, of a hand or an object in one motion: warn and reject
+ORIGIN = 1000.0  # m; farther from it, the library's 32 bits lose tenths of millimetres
 MISSING = 0.20  # share of a hand's frames that may be made up
 FILLED = "filled"  # key of the provenance: tracks with the frames made up for them
 
@@ -94,7 +96,28 @@ def check_demo(demo: HumanDemo) -> list[Finding]:
         if not PALM_LENGTH[0] < length < PALM_LENGTH[1]:
             text = f"{side} wrist to middle MCP {length:.3f} m; are these metres?"
             found.append(reject("E_UNIT", text))
-    return found + _check_missing(demo)
+    return found + _check_travel(demo) + _check_missing(demo)
+
+
+def _check_travel(demo: HumanDemo) -> list[Finding]:
+    """Tracks that leave the reach of one person, or are far from the origin."""
+    found = []
+    tracks = {f"{s} hand": p for s, p in demo.palm.items()}
+    tracks |= {f"object '{b.name}'": b.pose for b in demo.objects}
+    for what, pose in tracks.items():
+        usual = np.median(pose[:, :3], axis=0)
+        reach = float(np.linalg.norm(pose[:, :3] - usual, axis=-1).max())
+        away = float(np.linalg.norm(usual))
+        if reach > TRAVEL[0]:
+            level = "reject" if reach > TRAVEL[1] else "warn"
+            text = (
+                f"{what} goes {reach:.3g} m from where it mostly is; are these metres?"
+            )
+            found.append(Finding("E_UNIT", level, text))
+        if away > ORIGIN:
+            text = f"{what} is {away:.3g} m from the origin; are these metres?"
+            found.append(reject("E_UNIT", text))
+    return found
 
 
 def _jumps(demo: HumanDemo) -> list[int]:

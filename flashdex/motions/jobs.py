@@ -67,8 +67,13 @@ class Outcome:
         return self.prepared if stored is None else stored
 
 
-def run_job(job: Job) -> Outcome:
-    """Prepare one recording, or find it prepared; never raises for its content."""
+def run_job(job: Job, *, carry: bool = False) -> Outcome:
+    """Prepare one recording, or find it prepared; never raises for its content.
+
+    Args:
+        job: the recording and how.
+        carry: bring the motions along, for a caller that may not see this disk.
+    """
     root = job.settings.cache_dir or default_cache_dir()
     try:
         file = cache_file(job.recording, job.settings, root)
@@ -81,7 +86,7 @@ def run_job(job: Job) -> Outcome:
         write_prepared(file, prepared)
     rows = [item.row for item in prepared]
     # a disk that refuses the motions or their objects must not cost them
-    is_kept = read_prepared(file, root) is not None
+    is_kept = not carry and read_prepared(file, root) is not None
     return Outcome(rows, file, [] if is_kept else prepared)
 
 

@@ -193,9 +193,9 @@ class ManoModel:
         rows: list[int],
     ) -> np.ndarray:
         """Vertices ``rows`` carried by the joints, before the translation."""
-        feature = (rotations[:, 1:] - np.eye(3)).reshape(len(rotations), -1)
+        feature = (rotations[:, 1:] - np.eye(3)).reshape(-1, 9 * (NUM_JOINTS - 1))
         bent = self.arrays.pose_dirs[rows].reshape(-1, feature.shape[1])
-        skin = shaped[rows] + (feature @ bent.T).reshape(-1, len(rows), 3)
+        skin = shaped[rows] + (feature @ bent.T).reshape(len(feature), len(rows), 3)
         vertices = np.zeros_like(skin)
         for joint in range(NUM_JOINTS):
             moved = (skin - rest[joint]) @ turns[:, joint].swapaxes(1, 2)

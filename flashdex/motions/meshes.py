@@ -40,7 +40,7 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         raise MeshError(f"{path}: mesh file not found. Check the path in the source.")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError(
-            f"{path}: not a mesh that is read. Allowed: {', '.join(MESH_SUFFIXES)}."
+            f"{path}: not readable as a mesh. Allowed: {', '.join(MESH_SUFFIXES)}."
         )
     try:
         scene = trimesh.load_scene(path, process=False, skip_materials=True)

@@ -38,6 +38,8 @@ def content_hash(recording: Recording) -> str:
     """SHA-256 of what a recording is made of: its files' content and its key."""
     digest = hashlib.sha256(recording.key.encode())
     for file in recording.files:
+        if not file.is_file():  # a pipe would be waited for, a device has no end
+            raise OSError(f"{file} is not a file")
         digest.update(hash_file(file).encode())
     return digest.hexdigest()
 

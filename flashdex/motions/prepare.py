@@ -27,6 +27,7 @@ from flashdex.motions.recording import Recording, SourceOptions
 from flashdex.motions.residuals import RetargetWeights
 from flashdex.motions.sources import list_recordings
 
+FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
 
@@ -250,5 +251,10 @@ def make_report(rows: list[dict[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({k: _harmless(v) for k, v in row.items()} for row in rows)
     return text.getvalue()
+
+
+def _harmless(value: Any) -> Any:
+    """A text that a spreadsheet does not take for a formula."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in FORMULAS else value

@@ -19,6 +19,7 @@ from flashdex.motions.align import AlignedDemo, align
 from flashdex.motions.attempts import Choice, choose_attempt
 from flashdex.motions.checks import Finding, check_demo, make_strict, status_of
 from flashdex.motions.checks_aligned import check_aligned, check_retarget
+from flashdex.motions.checks_hands import check_company, check_sides
 from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.hand_model import HandModel
@@ -97,7 +98,7 @@ def prepare_motion(
     record = None
     try:
         demo.validate()
-        findings += check_demo(demo)
+        findings += check_demo(demo) + check_sides(demo)
         if status_of(findings) != "rejected":
             record = _prepare(demo, settings, findings, row)
     except (DemoError, MeshError) as error:
@@ -136,7 +137,7 @@ def _prepare(
     early, figures = check_aligned(
         aligned, assets, make_slot_grid(assets, solid=False), up=demo.up
     )
-    findings += early
+    findings += early + check_company(aligned)
     row |= figures
     if status_of(findings) == "rejected":
         return None

@@ -1,4 +1,4 @@
-"""Jobs over a Ray cluster; the files must lie where every node sees them."""
+"""Jobs over a Ray cluster; the recordings must lie where every node sees them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
         ray.init(log_to_driver=False)
     try:
         remote = ray.remote(max_retries=1)(run_job)
-        running = {remote.remote(job): i for i, job in enumerate(jobs)}
+        # the other nodes have caches of their own: motions travel with the answer
+        running = {remote.remote(job, carry=True): i for i, job in enumerate(jobs)}
         while running:
             (done,), _ = ray.wait(list(running), num_returns=1)
             yield running.pop(done), ray.get(done)

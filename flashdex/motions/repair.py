@@ -30,6 +30,7 @@ from flashdex.motions.gaps import (
 )
 from flashdex.motions.jumps import outliers
 from flashdex.motions.support import runs
+from flashdex.motions.tracks import FARTHEST
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation
 LEAST_TRACKED = 0.2  # share of frames below which a track is not worth keeping
@@ -75,16 +76,19 @@ def _blank(demo: HumanDemo) -> HumanDemo:
     """A copy in which a frame that lacks one value of a track lacks them all."""
     keypoints, palm = dict(demo.keypoints), dict(demo.palm)
     for side in demo.keypoints:
-        gone = missing_frames(demo.keypoints[side], demo.palm[side])
+        gone = _missing(demo.keypoints[side], demo.palm[side])
         keypoints[side] = np.where(gone[:, None, None], np.nan, demo.keypoints[side])
         palm[side] = np.where(gone[:, None], np.nan, demo.palm[side])
     objects = [
-        DemoObject(
-            b.name, b.mesh, np.where(missing_frames(b.pose)[:, None], np.nan, b.pose)
-        )
+        DemoObject(b.name, b.mesh, np.where(_missing(b.pose)[:, None], np.nan, b.pose))
         for b in demo.objects
     ]
     return replace(demo, keypoints=keypoints, palm=palm, objects=objects)
+
+
+def _missing(*tracks: np.ndarray) -> np.ndarray:
+    """Frames without a number, or with one that is no position, (T,) bool."""
+    return missing_frames(*(np.where(np.abs(t) < FARTHEST, t, np.nan) for t in tracks))
 
 
 def _drop(demo: HumanDemo, share: float, found: list[Finding]) -> HumanDemo:

@@ -10,6 +10,8 @@ from flashdex.keys import Side
 
 # frames of the Gaussian that smooths velocities (method.md 14)
 VELOCITY_SIGMA = 2.0
+# m; a number beyond is no position, and its square may not be a number at all
+FARTHEST = 1e6
 
 
 def rotation(quat: np.ndarray) -> Rotation:
@@ -47,7 +49,7 @@ def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
         the points span no palm: zeros stand for a missing hand in many files.
     """
     pose = np.full((len(keypoints), 7), np.nan)
-    seen = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
+    seen = np.asarray((np.abs(keypoints) < FARTHEST).all(axis=(1, 2)))
     points = np.where(seen[:, None, None], keypoints, np.nan)
     wrist, index, middle, pinky = (points[:, i] for i in (0, 5, 9, 17))
     x = _unit(middle - wrist)

@@ -137,6 +137,8 @@ def load_umetrack(file: Path) -> UmeTrackHand:
 
 
 def _read_model(file: Path) -> dict[str, Any]:
+    if file.exists() and not file.is_file():
+        raise DemoError(f"{file}: not a file but a folder, pipe or device.")
     try:
         model = json.loads(file.read_text(encoding="utf-8"))["hand_model"]
     except FileNotFoundError as error:

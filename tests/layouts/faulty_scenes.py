@@ -144,7 +144,9 @@ def teleport(scene, frames):
 
 
 def shake(scene):
-    noise = np.random.default_rng(3).normal(scale=0.02, size=scene.objects[0].pose.shape)
+    noise = np.random.default_rng(3).normal(
+        scale=0.02, size=scene.objects[0].pose.shape
+    )
     scene.objects[0].pose[:, :3] += noise[:, :3]
 
 

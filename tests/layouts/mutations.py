@@ -90,7 +90,11 @@ LAYOUTS = {
         own_rate=False,
     ),
     "oakink2": Kept(
-        "oakink2", 120, (_OAK, _OAK_MESH), own_rate=False, named=((_OAK, ("obj_list", 0)),)
+        "oakink2",
+        120,
+        (_OAK, _OAK_MESH),
+        own_rate=False,
+        named=((_OAK, ("obj_list", 0)),),
     ),
     "oakink2_program": Kept(
         "oakink2",

@@ -108,7 +108,7 @@ def test_archives_are_no_meshes(tmp_path):
     file = tmp_path / "mesh.zip"
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("mesh.obj", BOX.export(file_type="obj"))
-    with pytest.raises(MeshError, match=r"mesh\.zip: not a mesh that is read"):
+    with pytest.raises(MeshError, match=r"mesh\.zip: not readable as a mesh"):
         load_mesh(file)
 
 

@@ -158,7 +158,7 @@ def _nan_frames(track):
 
 
 def test_masks(tmp_path, scene):
-    """Available: one stream is enough; quality: all streams must agree."""
+    """Quality: all streams must agree. "Available" is false where one hand misses."""
     both, one = ("1201-1", "1201-2"), ("1201-2",)
     forbidden = {
         "hand_pose_available": {5: both, 6: one},
@@ -168,8 +168,8 @@ def test_masks(tmp_path, scene):
     }
     write(tmp_path, scene, masks=tuple(forbidden), forbidden=forbidden)
     demo = read(tmp_path)
-    assert _nan_frames(demo.keypoints["right"]) == [5, 35]
-    assert _nan_frames(demo.objects[0].pose) == [15, 25, 35]
+    assert _nan_frames(demo.keypoints["right"]) == [35]
+    assert _nan_frames(demo.objects[0].pose) == [25, 35]
     assert demo.provenance["absent_masks"] == []
     assert demo.provenance["masked_frames"] == dict.fromkeys(forbidden, 1)
 

@@ -172,6 +172,7 @@ def test_no_hand_is_left(tmp_path, scene):
         tmp_path,
         scene,
         no_hands=range(1, FRAMES),
-        forbidden={"hand_pose_available": {0: ("1201-1", "1201-2")}},
+        masks=("qa_pass",),
+        forbidden={"qa_pass": {0: ("1201-1", "1201-2")}},
     )
     _refused("no hand is tracked", tmp_path)

@@ -210,3 +210,9 @@ def test_inputs_hash_follows_content_not_place(tmp_path, monkeypatch, settings):
     assert hash_inputs(order) != first
     file.write_bytes(b"one")
     assert hash_inputs(order) == first
+
+
+def test_motions_travel_with_the_answer_where_disks_differ(settings, recording):
+    outcome = run_job(Job(recording, settings), carry=True)
+    elsewhere = replace(outcome, file=settings.cache_dir / "not" / "here.npz")
+    assert [item.row for item in elsewhere.load(settings.cache_dir)] == outcome.rows

@@ -57,7 +57,7 @@ def test_what_is_stored_comes_back(scene, tmp_path, turn):
         gaps = np.linalg.norm(points - hand.keypoints, axis=-1)
         assert gaps[:, [5, 9, 13, 17]].max() < 0.03
         assert gaps.mean() < 0.03
-        note = demo.provenance["filled"][side]["wrist_frame"]
+        note = demo.provenance["made_up"][side]["wrist_frame"]
         assert (
             note == "documented" if turn is None else note.startswith("from the tips")
         )
@@ -190,7 +190,7 @@ def test_gigahands_stores_no_wrist_but_mano_translation(scene, tmp_path):
         assert gap.max() < 0.02  # 0.1 without the correction
         tips = demo.keypoints[side][:, TIPS]
         np.testing.assert_allclose(tips, hand.keypoints[:, TIPS], atol=1e-5)
-        assert "translation" in demo.provenance["filled"][side]["wrist"]
+        assert "translation" in demo.provenance["made_up"][side]["wrist"]
 
 
 def test_the_first_hot3d_set_is_refused(scene, tmp_path):

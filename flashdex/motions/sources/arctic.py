@@ -33,7 +33,7 @@ from flashdex.motions.sources.axis_angle import (
 )
 from flashdex.motions.sources.mesh_files import scaled_mesh
 from flashdex.motions.sources.rigid import to_array
-from flashdex.motions.sources.roots import refuse_pointer, relative, require_folders
+from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame
 from flashdex.motions.unpickle import load_object_array
 
@@ -117,7 +117,7 @@ def list_arctic(options: SourceOptions) -> list[Recording]:
             f"{root / SEQUENCES}: no <subject>/<object>_<action>_<NN>.mano.npy "
             f"(E_ROOT). Unpack raw_seqs.zip there."
         )
-    refuse_pointer(recordings[0].files[0])
+    refuse_clone(recordings[0].files[:1])
     return recordings
 
 

@@ -22,7 +22,7 @@ from flashdex.motions.sources.fdr_clip import LICENCE, make_demo
 from flashdex.motions.sources.fdr_pack import NAME as PACK_NAME
 from flashdex.motions.sources.fdr_pack import pack_names, pack_objects, unpack
 from flashdex.motions.sources.mesh_files import seek_mesh
-from flashdex.motions.sources.roots import refuse_pointer
+from flashdex.motions.sources.roots import refuse_clone
 from flashdex.motions.unpickle import load_npz
 
 CLIP_FOLDERS = ("human_demo", "retargeted")
@@ -36,8 +36,7 @@ def list_fdr(options: SourceOptions) -> list[Recording]:
     """
     assert options.path is not None  # ``Source.needs``
     clips, pack = _find(options.path)
-    for file in [*clips, *([pack] if pack else [])]:
-        refuse_pointer(file)
+    refuse_clone([pack] if pack else clips[:1])
     if pack is not None:
         folders = mesh_folders(pack.parent, options.models)
         meshes = _existing(pack_objects(pack), folders)

@@ -31,7 +31,7 @@ from flashdex.motions.sources.axis_angle import (
     same_length,
     track,
 )
-from flashdex.motions.sources.roots import refuse_pointer, relative, require_folders
+from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame, rotation
 from flashdex.motions.unpickle import load_npz
 
@@ -112,7 +112,7 @@ def list_grab(options: SourceOptions) -> list[Recording]:
             f"{root / SEQUENCES}: no s1 ... s10/<object>_<action>_<take>.npz (E_ROOT). "
             f"Unpack the archives with GRAB's grab/unzip_grab.py."
         )
-    refuse_pointer(files[0])
+    refuse_clone(files[:1])
     recordings = []
     for file in files:
         sequence = GrabSequence(root=root, file=file, models=options.models, mano=mano)

@@ -35,7 +35,7 @@ from flashdex.motions.sources.hot3d_world import (
     refuse_without_truth,
     up_axis,
 )
-from flashdex.motions.sources.roots import refuse_pointer, relative
+from flashdex.motions.sources.roots import refuse_clone, relative
 from flashdex.motions.tracks import palm_frame
 
 SOURCE = "hot3d"
@@ -45,10 +45,12 @@ HEADSET_FILE = "headset_trajectory.csv"
 METADATA_FILE = "metadata.json"
 GROUPS = ("hot3d_dataset", "train", "test", "Aria", "Quest3")
 SEQUENCE = re.compile(r"P\d{4}_[0-9a-f]{8}")
-# which masks forbid what: hands, objects; and whether every stream must allow a frame
+# Which masks forbid what: hands, objects; and whether every stream must allow a frame.
+# The two that say "available" forbid nothing: one hand or one object that is missing
+# makes them false, and what is missing has no row anyway.
 MASKS: dict[str, tuple[bool, bool, bool]] = {
-    "hand_pose_available": (True, False, False),
-    "object_pose_available": (False, True, False),
+    "hand_pose_available": (False, False, False),
+    "object_pose_available": (False, False, False),
     "object_pose_quality": (False, True, True),
     "qa_pass": (True, True, True),
 }
@@ -67,8 +69,7 @@ def list_hot3d(options: SourceOptions) -> list[Recording]:
     folders = _find_sequences(root)
     if not folders:
         raise DemoError(_wrong_root(root))
-    for file in folders[0].glob(OBJECTS_FILE):
-        refuse_pointer(file)
+    refuse_clone([folders[0] / OBJECTS_FILE])
     library = find_library(root, options.models)
     mano = options.mano
     models = () if mano is None else tuple(mano_file(mano, side) for side in SIDES)

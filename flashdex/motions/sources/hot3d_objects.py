@@ -13,7 +13,7 @@ from flashdex.errors import DemoError
 from flashdex.motions.demo import DemoObject
 from flashdex.motions.sources.hot3d_files import BROKEN_JSON, Track, read_lines
 from flashdex.motions.sources.hot3d_time import FrameAxis
-from flashdex.motions.sources.roots import refuse_pointer
+from flashdex.motions.sources.roots import refuse_clone, refuse_pointer
 
 LIBRARY_NAMES = ("assets", "object_models", "object_library")
 INSTANCES = "instance.json"
@@ -49,7 +49,7 @@ class ObjectLibrary:
 
     def key(self) -> str:
         """Names and sizes of all models, as text: changes when one is added."""
-        models = sorted(self.folder.glob("*.glb"))
+        models = [f for f in sorted(self.folder.glob("*.glb")) if f.is_file()]
         return " ".join(f"{file.name}:{file.stat().st_size}" for file in models)
 
 
@@ -71,7 +71,7 @@ def find_library(root: Path, given: Path | None) -> ObjectLibrary:
     for folder in places:
         models = sorted(folder.glob("*.glb"))
         if models:
-            refuse_pointer(models[0])
+            refuse_clone(models[:1])
             return ObjectLibrary(folder)
     sought = ", ".join(str(place) for place in places)
     archives = sorted(p.name for p in (given or root).glob("*.zip"))

@@ -20,6 +20,7 @@ from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.meshes import hull_vertices
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources.roots import refuse_pointer
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
 from flashdex.motions.unpickle import load_arrays
@@ -139,6 +140,7 @@ def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
     pieces: dict[str, list[tuple[int, int]]] = {}
     for file in sorted(folder.glob("segments*.json")):
         try:
+            refuse_pointer(file)
             rows = json.loads(file.read_text(encoding="utf-8"))
             for row in rows:
                 span = (int(row["start"]), int(row["end"]))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import re
-import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from flashdex.motions.fetch import NOTE, myodm_dir
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.myohand import NUM_JOINTS, myohand_keypoints
 from flashdex.motions.tracks import palm_frame
+from flashdex.motions.unpickle import load_arrays
 
 FPS = 50.0
 # Recorded heights are slides of a body that stands this high, m ...
@@ -30,6 +30,7 @@ BODY_HEIGHT = 0.035
 ABSOLUTE_ENTRIES = 6
 # These stand 5 to 6 cm below the table: theirs is estimated from where they rest.
 SUNK = {"wineglass"}
+KEYS = ("time", "robot", "object", "object_init")
 OBJECT_NAME = re.compile(r"[a-z]+")
 
 
@@ -95,11 +96,12 @@ def read_clip(file: Path) -> list[HumanDemo]:
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            data = {k: stored[k] for k in ("time", "robot", "object", "object_init")}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DemoError(f"{file}: not a MyoDM clip ({error}).") from error
+    stored = load_arrays(file, only=KEYS)
+    if missing := [key for key in KEYS if key not in stored]:
+        raise DemoError(f"{file}: not a MyoDM clip: lacks {', '.join(missing)}.")
+    data = {key: stored[key] for key in KEYS}
+    if data["time"].ndim != 1 or data["time"].dtype.kind != "f":
+        raise DemoError(f"{file}: 'time' must be a list of seconds, (T,).")
     frames = len(data["time"])
     expected = {"robot": (frames, NUM_JOINTS), "object": (frames, 7)}
     for key, shape in expected.items():

@@ -18,7 +18,7 @@ from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.oakink2_files import ANNOTATIONS, OakInk2Sequence
 from flashdex.motions.sources.oakink2_program import read_program
 from flashdex.motions.sources.oakink2_sequence import read_sequence
-from flashdex.motions.sources.roots import refuse_pointer, require_folders
+from flashdex.motions.sources.roots import refuse_clone, require_folders
 
 # Repaired meshes are more often closed; all releases share the frame of the object.
 MESH_FOLDERS = ("object_repair", "object_preview", "object_raw", "object_scan")
@@ -42,7 +42,7 @@ def list_oakink2(options: SourceOptions) -> list[Recording]:
         for file in sorted((root / ANNOTATIONS).glob("*.pkl"))
     ]
     if sequences:
-        refuse_pointer(sequences[0].annotation)  # a clone of pointers: all are
+        refuse_clone([sequences[0].annotation])  # a clone of pointers: all are
     return [
         Recording(
             name=sequence.token,

@@ -170,7 +170,7 @@ def _support(bodies: list[DemoObject]) -> tuple[float, list[str]]:
         height, found = estimate_support(poses, vertices, FPS / SUPPORT_STRIDE)
     if found:
         return height, []
-    return 0.0, ["support: nothing rests; the table is taken to be at y = 0"]
+    return 0.0, ["W_SUPPORT: nothing rests; the table is taken to be at y = 0"]
 
 
 def _keypoints(

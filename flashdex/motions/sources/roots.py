@@ -37,8 +37,15 @@ def refuse_pointer(file: Path) -> None:
     """Refuse a Git-LFS pointer, which stands where the file should be.
 
     Raises:
-        DemoError: the file is a pointer.
+        DemoError: the file is a pointer, or no file at all but a folder, a pipe, a
+            device or a broken link.
+        FileNotFoundError: there is nothing.
     """
+    if not file.is_file() and (file.exists() or file.is_symlink()):
+        raise DemoError(
+            f"{file}: E_FILE: not a file but a folder, a pipe, a device or a broken "
+            f"link. Put the file itself there."
+        )
     if file.stat().st_size >= POINTER_SIZE:
         return
     with file.open("rb") as stream:
@@ -48,6 +55,19 @@ def refuse_pointer(file: Path) -> None:
             f"{file}: E_ROOT: a Git-LFS pointer, not the file itself. "
             f"Download the content: git lfs pull, or the dataset's own tool."
         )
+
+
+def refuse_clone(files: Sequence[Path]) -> None:
+    """Refuse a clone whose content was not fetched: its first files are pointers.
+
+    Whatever else is wrong with a file costs its own recording only, when it is read.
+
+    Raises:
+        DemoError: one of the files is a pointer.
+    """
+    for file in files:
+        if file.is_file():
+            refuse_pointer(file)
 
 
 def relative(file: Path, root: Path) -> str:

@@ -20,7 +20,7 @@ from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.recording import Recording, Source, SourceOptions
-from flashdex.motions.sources.roots import refuse_pointer
+from flashdex.motions.sources.roots import refuse_clone
 from flashdex.motions.sources.spider_hand import fill_hand
 from flashdex.motions.sources.spider_scene import (
     INFO,
@@ -30,7 +30,7 @@ from flashdex.motions.sources.spider_scene import (
     read_objects,
     task_info,
 )
-from flashdex.motions.tracks import palm_frame
+from flashdex.motions.tracks import FARTHEST, palm_frame
 from flashdex.motions.unpickle import load_npz
 
 FILE = "trajectory_keypoints.npz"
@@ -68,10 +68,10 @@ def list_spider(options: SourceOptions) -> list[Recording]:
             f"SPIDER's dataset folder (the one that holds processed/), or unpack it. "
             f"Robot results (trajectory_mjwp.npz) are not human references."
         )
+    refuse_clone(files[:1])
     names = [_name(file) for file in files]
     recordings = []
     for name, file in zip(names, files, strict=True):
-        refuse_pointer(file)
         recordings.append(
             Recording(
                 name=name if names.count(name) == 1 else _full_name(file),
@@ -123,7 +123,7 @@ def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
             provenance={
                 "files": [file.name, *([INFO] if info_file else [])],
                 "keypoints": "tips, PIP and DIP only" if pip else "tips only",
-                "filled": notes,
+                "made_up": notes,
                 "fps": "ref_dt" if info.get("ref_dt") else "SPIDER's reference rate",
             },
         )
@@ -142,7 +142,7 @@ def _read_hand(
             f"{file}: qpos_finger_{side} {finger.shape} and qpos_wrist_{side} "
             f"{wrist.shape}; expected (T, 5, 7) and (T, 7)."
         )
-    tips = finger[..., :3]
+    tips = np.where(np.abs(finger[..., :3]) < FARTHEST, finger[..., :3], np.nan)
     if not np.nan_to_num(np.ptp(tips, axis=1)).max(initial=0.0) > ABSENT_SPREAD:
         return None
     offset = NO_WRIST.get(dataset)

@@ -13,6 +13,7 @@ from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import QUAT_TOLERANCE, DemoObject
 from flashdex.motions.sources.mesh_files import find_mesh, mesh_in
+from flashdex.motions.tracks import FARTHEST
 
 INFO = "task_info.json"
 
@@ -60,7 +61,7 @@ def hand_object(
 def pose_track(stored: np.ndarray, what: str) -> np.ndarray:
     """Pose track with NaN where the quaternion is zero."""
     norm = np.linalg.norm(stored[:, 3:], axis=-1)
-    seen = norm > 0
+    seen = (norm > 0) & (np.abs(stored) < FARTHEST).all(axis=-1)
     if (np.abs(norm[seen] - 1) > QUAT_TOLERANCE).any():
         raise DemoError(f"{what}: quaternions of norm {norm[seen].max():.3f}; unit.")
     return np.where(seen[:, None], stored, np.nan)

@@ -20,7 +20,7 @@ from flashdex.errors import DemoError
 from flashdex.keys import SIDES
 from flashdex.motions.mano import mano_file
 from flashdex.motions.recording import Recording, Source, SourceOptions
-from flashdex.motions.sources.roots import refuse_pointer, require_folders
+from flashdex.motions.sources.roots import refuse_clone, require_folders
 from flashdex.motions.sources.taco_sequence import (
     HANDS,
     OBJECTS,
@@ -64,8 +64,8 @@ def list_taco(options: SourceOptions) -> list[Recording]:
             root=root, folder=folder, name=name, split=split, meshes=meshes, mano=mano
         )
         recordings.append(_recording(whole, models))
-    for file in recordings[0].files if recordings else ():
-        refuse_pointer(file)  # an unfetched repository consists of pointers only
+    # an unfetched repository consists of pointers only
+    refuse_clone(recordings[0].files if recordings else ())
     return recordings
 
 

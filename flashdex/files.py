@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -83,7 +83,7 @@ def hash_file(path: Path) -> str:
     return _hash_file(path, stat.st_size, stat.st_mtime_ns)
 
 
-@lru_cache(maxsize=4096)
+@cache
 def _hash_file(path: Path, size: int, changed: int) -> str:
     del size, changed  # they are part of the cache's key only
     with path.open("rb") as file:

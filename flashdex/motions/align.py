@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from flashdex.errors import DemoError
 from flashdex.keys import SIDES
 from flashdex.motions.contacts import (
     NO_OBJECT,
@@ -51,6 +50,7 @@ class AlignedDemo:
         object_names: per slot.
         support_z: height of the table in the recording, m.
         support_found: whether it comes from rest or the reader, not from a guess.
+        left_out: poses (T, 7) of objects that found no slot, by name.
     """
 
     name: str
@@ -67,6 +67,7 @@ class AlignedDemo:
     object_names: list[str]
     support_z: float
     support_found: bool
+    left_out: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -95,8 +96,10 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
         pose[:, :3] += lift
     keypoints, palm = _hands(demo, turn, times, lift)
     present = np.array([side in demo.keypoints for side in SIDES])
-    slots, used, tip_dist = _assign(demo, keypoints, present, poses, meshes)
+    roles = _assign(demo, keypoints, present, poses, meshes, control_hz)
+    tip_dist, slots, chosen = roles.tip_dist, roles.kept, roles.chosen
     contact = np.stack([contact_runs(tip_dist[:, h], control_hz) for h in range(2)], 1)
+    used = np.array([slots.index(chosen[h]) if h in chosen else -1 for h in range(2)])
     return AlignedDemo(
         name=demo.name,
         fps=control_hz,
@@ -112,6 +115,7 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
         object_names=[demo.objects[i].name for i in slots],
         support_z=float(height),
         support_found=found,
+        left_out={demo.objects[i].name: poses[i] for i in roles.left_out},
     )
 
 
@@ -134,29 +138,46 @@ def _hands(
     return keypoints, palm
 
 
+@dataclass
+class _Roles:
+    """Objects kept (rows of the demo), each hand's object, and its tip distances."""
+
+    kept: list[int]
+    left_out: list[int]
+    chosen: dict[int, int]
+    tip_dist: np.ndarray
+
+
 def _assign(
     demo: HumanDemo,
     keypoints: np.ndarray,
     present: np.ndarray,
     poses: list[np.ndarray],
     meshes: list[trimesh.Trimesh],
-) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Objects kept (rows of the demo), slot of each hand, and its tip distances."""
+    fps: float,
+) -> _Roles:
+    """Give slots to what hands touch longest, then to what moves most.
+
+    An idle hand is given the object nearest to it for its distances, but no slot.
+    """
+    touched = np.zeros(len(poses), dtype=int)  # frames
     chosen: dict[int, int] = {}
     tip_dist = np.full((len(keypoints), 2, 5), NO_OBJECT)
     for hand in np.flatnonzero(present):
         side = SIDES[hand]
-        fixed = (
-            [demo.hand_object[side]] if side in demo.hand_object else range(len(poses))
-        )
-        near = [tip_distances(keypoints[:, hand], poses[i], meshes[i]) for i in fixed]
+        told = demo.hand_object.get(side)
+        options = range(len(poses)) if told is None else [told]
+        near = [tip_distances(keypoints[:, hand], poses[i], meshes[i]) for i in options]
+        runs = [contact_runs(d, fps).any(axis=1).sum() for d in near]
         best = assign_object(near)
-        chosen[int(hand)] = fixed[best]
         tip_dist[:, hand] = near[best]
-    slots = sorted(set(chosen.values()))
-    slots += [i for i in range(len(poses)) if i not in slots]
-    slots = slots[:NUM_OBJECT_SLOTS]
-    if not slots:
-        raise DemoError(f"{demo.name}: no object is near a hand.")
-    used = np.array([slots.index(chosen[h]) if h in chosen else -1 for h in range(2)])
-    return slots, used, tip_dist
+        touched[list(options)] += runs
+        if told is not None or runs[best]:
+            chosen[int(hand)] = options[best]
+    used = set(chosen.values())
+    travel = [float(np.ptp(p[:, :3], axis=0).max()) for p in poses]
+    order = sorted(
+        range(len(poses)), key=lambda i: (i not in used, -touched[i], -travel[i])
+    )
+    kept = sorted(order[:NUM_OBJECT_SLOTS])
+    return _Roles(kept, order[NUM_OBJECT_SLOTS:], chosen, tip_dist)

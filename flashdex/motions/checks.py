@@ -110,9 +110,7 @@ def _check_travel(demo: HumanDemo) -> list[Finding]:
         away = float(np.linalg.norm(usual))
         if reach > TRAVEL[0]:
             level = "reject" if reach > TRAVEL[1] else "warn"
-            text = (
-                f"{what} goes {reach:.3g} m from where it mostly is; are these metres?"
-            )
+            text = f"{what} goes {reach:.3g} m from where it mostly is; in metres?"
             found.append(Finding("E_UNIT", level, text))
         if away > ORIGIN:
             text = f"{what} is {away:.3g} m from the origin; are these metres?"

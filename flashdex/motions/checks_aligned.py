@@ -42,7 +42,7 @@ def check_aligned(
     Returns:
         Findings, and figures for the report.
     """
-    travel, turn = _object_motion(aligned)
+    travel, turn = _object_motion(aligned.poses)
     depth = _tip_depth(aligned, sdf)
     figures = {
         "frames": aligned.num_frames,
@@ -58,6 +58,7 @@ def check_aligned(
     found = check_objects(assets) + check_overlap(assets, aligned.poses, sdf)
     moves = (travel > STATIC_TRAVEL) | (turn > STATIC_TURN)
     found += _check_contact(aligned, moves=bool(moves.any()))
+    found += _check_left_out(aligned)
     if depth > TIP_DEPTH[0]:
         level = "reject" if depth > TIP_DEPTH[1] else "warn"
         text = f"a fingertip is {1e3 * depth:.0f} mm inside the object"
@@ -87,10 +88,27 @@ def _check_contact(aligned: AlignedDemo, *, moves: bool) -> list[Finding]:
     return [Finding("W_STATIC", "warn", "touched, but no object moves")]
 
 
-def _object_motion(aligned: AlignedDemo) -> tuple[np.ndarray, np.ndarray]:
+def _check_left_out(aligned: AlignedDemo) -> list[Finding]:
+    """Objects for which there is no slot: harmless only while they lie still."""
+    if not aligned.left_out:
+        return []
+    travel, turn = _object_motion(list(aligned.left_out.values()))
+    moves = (travel > STATIC_TRAVEL) | (turn > STATIC_TURN)
+    names = np.array(list(aligned.left_out))
+    found = []
+    if moves.any():
+        text = f"{', '.join(names[moves])} moves but is left out: two objects at most"
+        found.append(Finding("W_OBJECTS", "warn", text))
+    if not moves.all():
+        text = f"{', '.join(names[~moves])} left out: two objects at most"
+        found.append(Finding("I_OBJECTS", "info", text))
+    return found
+
+
+def _object_motion(poses: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Largest travel (m) and turn (rad) from the first frame, per object."""
     travel, turn = [], []
-    for pose in aligned.poses:
+    for pose in poses:
         travel.append(np.linalg.norm(pose[:, :3] - pose[0, :3], axis=-1).max())
         rot = rotation(pose[:, 3:])
         turn.append((rot * rot[0].inv()).magnitude().max())

@@ -86,10 +86,10 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
 def _is_complete(folder: Path) -> bool:
     try:
         stored = json.loads((folder / "source.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        complete = all((folder / name).is_file() for name in stored["files"])
+        return complete and stored["sha256"] == WHEEL_SHA256
+    except (OSError, ValueError, KeyError, TypeError):
         return False
-    files = [folder / name for name in stored.get("files", [])]
-    return stored.get("sha256") == WHEEL_SHA256 and all(f.is_file() for f in files)
 
 
 def _download(folder: Path) -> Path:

@@ -7,7 +7,9 @@ rejected row of the report, so that one bad file never costs the others.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +92,13 @@ def run_job(job: Job, *, carry: bool = False) -> Outcome:
     return Outcome(rows, file, [] if is_kept else prepared)
 
 
+def crashed(job: Job) -> Outcome:
+    """The outcome of a job whose worker died."""
+    text = "the worker process died (out of memory, or a crash in a mesh library)"
+    rejected = _reject(job.recording.name, "E_CRASH", text)
+    return Outcome([rejected.row], None, [rejected])
+
+
 def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
     """All motions of a recording, rejected ones too.
 
@@ -97,16 +106,12 @@ def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Pr
         recording: listed by a source.
         settings: how.
     """
-    try:
+
+    def read_all() -> list[Prepared]:
         demos = recording.read()
         return [item for demo in demos for item in prepare_demo(demo, settings)]
-    except (DemoError, MeshError) as error:
-        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        return [_reject(recording.name, code, str(error))]
-    except Exception as error:  # what no check foresaw must not end the others
-        logger.debug("%s", recording.name, exc_info=True)
-        text = f"unforeseen {type(error).__name__}: {error}"
-        return [_reject(recording.name, "E_READ", text)]
+
+    return _guard(recording.name, read_all)
 
 
 def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
@@ -116,6 +121,10 @@ def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
         demo: as read.
         settings: how.
     """
+    return _guard(demo.name, partial(_prepare_pieces, demo, settings))
+
+
+def _prepare_pieces(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
     demo = _paced(demo, settings.speed)
     demo.validate(complete=False)
     is_cut = _is_cut(demo, settings)
@@ -126,7 +135,28 @@ def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
         findings += remarks
     if not pieces:
         return [reject(demo.name, findings)]
-    return [prepare_motion(p, settings, concerning(findings, p)) for p in pieces]
+    return [item for p in pieces for item in _prepare_piece(p, settings, findings)]
+
+
+def _prepare_piece(
+    piece: HumanDemo, settings: MotionSettings, findings: list[Finding]
+) -> list[Prepared]:
+    told = concerning(findings, piece)
+    return _guard(piece.name, lambda: [prepare_motion(piece, settings, told)])
+
+
+def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
+    """What one step makes; what goes wrong in it costs nothing but this step."""
+    try:
+        return make()
+    except (DemoError, MeshError) as error:
+        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
+        return [_reject(name, code, str(error))]
+    except OSError as error:  # a name too long, a folder that may not be entered
+        return [_reject(name, "E_FILE", f"cannot be read: {error}")]
+    except Exception as error:  # what no check foresaw must not end the others
+        logger.debug("%s", name, exc_info=True)
+        return [_reject(name, "E_READ", f"unforeseen {type(error).__name__}: {error}")]
 
 
 def _notes(demo: HumanDemo) -> list[Finding]:

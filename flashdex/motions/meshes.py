@@ -46,12 +46,18 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
         _refuse_large(scene)
         mesh = scene.to_mesh()
+        if len(mesh.faces) and not _joins_vertices(mesh):
+            raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
         raise MeshError(
             f"{path}: not readable as a mesh ({error}). "
             f"Allowed: {', '.join(MESH_SUFFIXES)}."
         ) from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def _joins_vertices(mesh: trimesh.Trimesh) -> bool:
+    return mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
 
 
 def _refuse_large(scene: trimesh.Scene) -> None:
@@ -107,6 +113,8 @@ def hull_vertices(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh is empty (no triangles). Export it again.")
+    if not _joins_vertices(mesh):
+        raise MeshError(f"{name}: triangles of vertices that are not there.")
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices)).any(axis=-1).sum())
         raise MeshError(f"{name}: {bad} vertices are not finite (NaN or infinite).")

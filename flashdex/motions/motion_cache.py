@@ -101,7 +101,7 @@ def write_prepared(file: Path, prepared: list[Prepared]) -> None:
             "info": record.info,
         }
     try:
-        arrays["entries"] = np.array(json.dumps(entries))
+        arrays["entries"] = np.array(json.dumps(entries, default=str))
         with open_atomic(file) as stream:
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     except OSError as error:

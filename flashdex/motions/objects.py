@@ -139,10 +139,12 @@ def make_object(
         mesh = load_mesh(path)
     key = _fingerprint(mesh, settings)
     file = (cache_dir or default_cache_dir()) / "objects" / f"{key}.npz"
+    stamp = _stamp(file)
     values = read_cache(file, required=_COMPUTED)
     if values is None:
         with waiting_lock(file):  # two workers often meet the same object at once
-            values = read_cache(file, required=_COMPUTED)
+            if _stamp(file) != stamp:
+                values = read_cache(file, required=_COMPUTED)
             if values is None:
                 values = _compute(mesh, settings, where)
                 write_cache(file, values)
@@ -178,6 +180,14 @@ def _fingerprint(mesh: trimesh.Trimesh, settings: ObjectSettings) -> str:
     text = json.dumps([CACHE_VERSION, asdict(settings)], sort_keys=True)
     digest.update(text.encode())
     return digest.hexdigest()
+
+
+def _stamp(file: Path) -> int | None:
+    """When a file was written; None where there is none."""
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return None
 
 
 def _tell_open(where: str, *, is_watertight: bool) -> None:

@@ -14,12 +14,11 @@ from concurrent.futures.process import BrokenProcessPool
 import torch
 from tqdm import tqdm
 
-from flashdex.motions.checks import Finding
-from flashdex.motions.jobs import Job, Outcome, run_job
-from flashdex.motions.process import reject
+from flashdex.motions.jobs import Job, Outcome, crashed, run_job
 
 _LOG = logging.getLogger(__name__)
 
+MESHES = (".obj", ".stl", ".ply", ".glb", ".off")
 LINE_SECONDS = 15.0  # between progress lines where there is no terminal
 # One worker is one core: threads of torch and CoACD would fight over the others.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -61,7 +60,7 @@ def _new_meshes_first(jobs: list[Job]) -> list[int]:
     first, later = [], []
     for i, job in enumerate(jobs):
         files = job.recording.files
-        meshes = {str(f) for f in files if f.suffix.lower() in (".obj", ".stl", ".ply")}
+        meshes = {str(f) for f in files if f.suffix.lower() in MESHES}
         (first if meshes - seen else later).append(i)
         seen |= meshes
     return first + later
@@ -78,7 +77,7 @@ def _run_in_processes(jobs: list[Job], workers: int) -> Iterator[tuple[int, Outc
         for place in suspects:  # alone, the one that kills its worker is found
             job = left.pop(place)
             alone = list(_run_pool({place: job}, 1, []))
-            yield alone[0] if alone else (place, _died(job))
+            yield alone[0] if alone else (place, crashed(job))
 
 
 def _run_pool(
@@ -117,12 +116,6 @@ def _pool(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(
         workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)
     )
-
-
-def _died(job: Job) -> Outcome:
-    text = "the worker process died (out of memory, or a crash in a mesh library)"
-    rejected = reject(job.recording.name, [Finding("E_CRASH", "reject", text)])
-    return Outcome([rejected.row], None, [rejected])
 
 
 def _show(

@@ -199,7 +199,7 @@ def _record(
             "licence": demo.licence,
             "split": demo.split,
             "task": demo.task,
-            "source_fps": demo.fps,
+            "source_fps": demo.fps / demo.provenance.get("speed", 1.0),
             "objects": aligned.object_names,
             "support_z": aligned.support_z,
             "attempt_scores_m": choice.scores,

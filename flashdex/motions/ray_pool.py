@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from flashdex.errors import MissingExtraError
-from flashdex.motions.jobs import Job, Outcome, run_job
+from flashdex.motions.jobs import Job, Outcome, crashed, run_job
 
 
 def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
@@ -32,7 +32,11 @@ def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
         running = {remote.remote(job, carry=True): i for i, job in enumerate(jobs)}
         while running:
             (done,), _ = ray.wait(list(running), num_returns=1)
-            yield running.pop(done), ray.get(done)
+            place = running.pop(done)
+            try:
+                yield place, ray.get(done)
+            except ray.exceptions.RayError:
+                yield place, crashed(jobs[place])
     finally:
         if started:
             ray.shutdown()

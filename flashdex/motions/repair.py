@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flashdex.errors import MeshError
 from flashdex.keys import Side
 from flashdex.motions.checks import (
     FILLED,
@@ -21,6 +22,7 @@ from flashdex.motions.checks import (
     reject,
 )
 from flashdex.motions.demo import QUAT_TOLERANCE, DemoObject, HumanDemo
+from flashdex.motions.demo_support import demo_support
 from flashdex.motions.gaps import (
     align_signs,
     fill_points,
@@ -248,4 +250,13 @@ def _split(demo: HumanDemo) -> tuple[list[HumanDemo], list[Finding]]:
     lost = (demo.num_frames - sum(b - a for a, b in long)) / demo.fps
     text = f"long gaps: {len(long)} cut out of at least {MIN_SECONDS} s, {lost:.1f} s"
     found = Finding("E_NAN", "warn", f"{text} lost")
+    if demo.support_z is None and len(long) > 1:
+        demo = replace(demo, support_z=_table(demo))
     return [demo.cut(a, b, name=f"{demo.name}_{a}_{b}") for a, b in long], [found]
+
+
+def _table(demo: HumanDemo) -> float | None:
+    try:
+        return demo_support(demo)
+    except MeshError:
+        return None  # every piece says what is wrong with its mesh

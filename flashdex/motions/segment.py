@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_dilation, uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from flashdex.errors import MeshError
 from flashdex.keys import Side
@@ -18,7 +17,6 @@ from flashdex.motions.activity import (
     bridge,
     find_activity,
 )
-from flashdex.motions.align import UP_ROTATION
 from flashdex.motions.checks import (
     FILLED,
     MAX_SECONDS,
@@ -27,13 +25,13 @@ from flashdex.motions.checks import (
     reject,
 )
 from flashdex.motions.demo import HumanDemo
+from flashdex.motions.demo_support import demo_support
 from flashdex.motions.gaps import missing_frames
 from flashdex.motions.meshes import clean_mesh
 from flashdex.motions.neighbours import Surfaces
 from flashdex.motions.repair import keep
 from flashdex.motions.roles import Use, find_use
-from flashdex.motions.support import estimate_support, runs
-from flashdex.motions.tracks import transform_pose
+from flashdex.motions.support import runs
 
 MARGIN_SECONDS = 0.33
 CALM_SECONDS = 0.5  # a still point is the middle of this long a calm
@@ -63,7 +61,7 @@ def segment(
     if not meshes:
         return [], [*found, reject("E_MESH", "no object has a usable mesh")]
     if demo.support_z is None:
-        demo = replace(demo, support_z=session_support(demo, meshes))
+        demo = replace(demo, support_z=demo_support(demo, meshes))
     session = _Session(demo, find_activity(demo, meshes), Surfaces(meshes))
     windows = _windows(session.activity, demo.fps)
     pieces = [p for a, b in windows for p in session.pieces(a, b)]
@@ -83,26 +81,6 @@ def _load_meshes(
             text = f"object '{body.name}' left out: {error}"
             found.append(Finding("E_MESH", "warn", text))
     return keep(demo, list(demo.keypoints), sound), meshes
-
-
-def session_support(demo: HumanDemo, meshes: list[trimesh.Trimesh]) -> float | None:
-    """Height of the table that a session's objects rest on, m; None if none rests.
-
-    Args:
-        demo: with NaN where an object was not tracked.
-        meshes: of its objects, m.
-    """
-    turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
-    poses, vertices = [], []
-    for body, mesh in zip(demo.objects, meshes, strict=True):
-        hull = np.asarray(mesh.convex_hull.vertices)
-        for start, end in runs(~missing_frames(body.pose), least=3):
-            poses.append(transform_pose(body.pose[start:end], turn))
-            vertices.append(hull)
-    if not poses:
-        return None
-    height, found = estimate_support(poses, vertices, demo.fps)
-    return height if found else None
 
 
 def _windows(activity: Activity, fps: float) -> list[tuple[int, int]]:

@@ -144,7 +144,7 @@ def load_torch(path: Path) -> Any:
 def _guard(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
     """Read a file; whatever is wrong with it becomes one clear message."""
     if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise DemoError(f"{path}: not a file but a folder, pipe or device.")
+        raise DemoError(f"{path}: cannot be read: a folder, a pipe or a device.")
     try:
         with path.open("rb") as file:
             if file.read(len(LFS)) == LFS:

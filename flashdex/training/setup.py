@@ -20,7 +20,7 @@ from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
-from flashdex.errors import FlashdexError, LibraryError
+from flashdex.errors import DemoError, FlashdexError, LibraryError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
@@ -160,7 +160,11 @@ def _load_library(recipe: Recipe) -> MotionLibrary:
     order = _order(recipe)
     if (folder / "manifest.json").is_file():
         library = MotionLibrary.load(folder)
-        if library.manifest.get("inputs") == hash_inputs(order):
+        try:
+            if library.manifest.get("inputs") == hash_inputs(order):
+                return library
+        except DemoError as error:
+            _LOG.info("%s is used as it is; its recordings: %s", folder, error)
             return library
         _LOG.info("the recordings have changed since %s was prepared", folder)
     _LOG.info("preparing motions from '%s' in %s", motions.source, folder)

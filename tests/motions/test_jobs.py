@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from flashdex.errors import DemoError
+from flashdex.motions.align import align
+from flashdex.motions.checks_aligned import _check_left_out
 from flashdex.motions.jobs import Job, run_job
 from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.prepare import Order, hash_inputs, prepare, run_order
 from flashdex.motions.process import MotionSettings
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.repair import repair
 from flashdex.motions.sources import SOURCES, list_recordings
 from flashdex.motions.sources.procedural import procedural
 
@@ -216,3 +219,57 @@ def test_motions_travel_with_the_answer_where_disks_differ(settings, recording):
     outcome = run_job(Job(recording, settings), carry=True)
     elsewhere = replace(outcome, file=settings.cache_dir / "not" / "here.npz")
     assert [item.row for item in elsewhere.load(settings.cache_dir)] == outcome.rows
+
+
+def test_bad_motion_costs_none_of_the_others(settings):
+    good = procedural(0, kinds=["pick_box_right"])[0].cut(0, 40, name="short")
+    bad = replace(good, name="bad", keypoints={"right": good.keypoints["right"][:5]})
+    outcome = run_job(Job(Recording(name="both", read=lambda: [good, bad]), settings))
+    assert [row["motion"] for row in outcome.rows] == ["short", "bad"]
+    assert statuses([outcome]) == ["R_SHORT", "E_DEMO"]
+
+
+def test_pieces_around_gaps_share_the_table_of_the_recording():
+    demo = procedural(0, kinds=["pick_box_right"])[0]
+    box = demo.objects[0]
+    top = int(box.pose[:, 2].argmax())
+    index = np.repeat([0, 0, top, top, 0], [80, 20, 80, 20, 80])
+    gaps = np.repeat([False, True, False, True, False], [80, 20, 80, 20, 80])
+
+    def play(track):
+        return np.where(gaps.reshape(-1, *[1] * (track.ndim - 1)), np.nan, track[index])
+
+    held = replace(
+        demo,
+        keypoints={s: play(k) for s, k in demo.keypoints.items()},
+        palm={s: play(p) for s, p in demo.palm.items()},
+        objects=[replace(box, pose=play(box.pose))],
+        support_z=None,
+    )
+    pieces, _ = repair(held)
+    assert [p.num_frames for p in pieces] == [80, 80, 80]
+    assert pieces[1].objects[0].pose[:, 2].min() > box.pose[0, 2] + 0.05
+    assert [p.support_z for p in pieces] == pytest.approx([0.0] * 3, abs=2e-3)
+
+
+def test_objects_without_a_slot_are_chosen_by_touch_and_told():
+    demo = procedural(0, kinds=["pick_box_right"])[0]
+    box = demo.objects[0]
+    still = np.tile(box.pose[0], (demo.num_frames, 1))
+    still[:, 0] += 0.4
+    shaken = still.copy()
+    shaken[:, 1] += 0.1 * np.sin(np.linspace(0, 6, demo.num_frames))
+    others = [
+        replace(box, name="still", pose=still),
+        replace(box, name="shaken", pose=shaken),
+    ]
+    demo = replace(demo, objects=[*others, box], hand_object={})
+    aligned = align(demo, control_hz=15.0)
+    assert aligned.object_names == ["shaken", "box"]
+    assert aligned.hand_object.tolist() == [-1, 1]
+    assert list(aligned.left_out) == ["still"]
+    moving = replace(demo, objects=[others[1], replace(others[1], name="b"), box])
+    aligned = align(moving, control_hz=15.0)
+    assert aligned.object_names[-1] == "box"
+    codes = [f.code for f in _check_left_out(aligned)]
+    assert codes == ["W_OBJECTS"]

@@ -137,11 +137,12 @@ def test_keypoints_reader_and_rejected_rows(tmp_path, cache):
         objects=QUICK,
         cache_dir=cache,
     )
-    assert library.names == ["good_0_130"]
+    assert library.names == ["good_0_130", "hole"]
     with open(library.path / "report.csv", encoding="utf-8") as file:
         rows = {r["motion"]: r for r in csv.DictReader(file)}
     assert rows["holes"]["status"] == "rejected"
-    assert "NaN or infinity in 1 frames, first in frame 40" in rows["holes"]["reason"]
+    assert "E_NAN: hands and objects are tracked together" in rows["holes"]["reason"]
+    assert "E_NAN" in rows["hole"]["reason"]
 
 
 @pytest.mark.parametrize(

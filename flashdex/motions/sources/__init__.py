@@ -47,7 +47,12 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     if missing:
         told = ", ".join("--input" if m == "path" else f"--{m}" for m in missing)
         raise DemoError(f"{source}: {told} is missing. It reads {reader.about}")
-    recordings = reader.list(options)
+    if options.limit is not None and options.limit < 1:
+        raise DemoError(f"{source}: --limit is {options.limit}; at least 1 is needed.")
+    try:
+        recordings = reader.list(options)
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise DemoError(f"{source}: cannot be read: {error}.") from error
     if not recordings:
         raise DemoError(f"{source}: no recordings in {options.path}.")
     return recordings if options.limit is None else recordings[: options.limit]

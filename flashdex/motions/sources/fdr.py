@@ -12,12 +12,11 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources.entries import words
 from flashdex.motions.sources.fdr_clip import LICENCE, make_demo
 from flashdex.motions.sources.fdr_pack import NAME as PACK_NAME
 from flashdex.motions.sources.fdr_pack import pack_names, pack_objects, unpack
@@ -125,7 +124,7 @@ def _ids(clip: Path) -> list[str]:
         arrays = load_npz(clip, only=names).values()
     except DemoError:
         return []
-    return sorted({str(name) for array in arrays for name in np.atleast_1d(array)})
+    return sorted({name for array in arrays for name in words(array)})
 
 
 def _existing(names: list[str], folders: tuple[Path, ...]) -> tuple[Path, ...]:

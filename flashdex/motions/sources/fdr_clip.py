@@ -14,6 +14,7 @@ import numpy as np
 from flashdex.errors import DemoError
 from flashdex.keys import FINGERS, SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
+from flashdex.motions.sources.entries import number, numbers, word
 from flashdex.motions.sources.fdr_scene import context_objects, support_height
 from flashdex.motions.sources.mesh_files import find_mesh, scaled_mesh, seek_mesh
 from flashdex.motions.sources.rigid import poses_from_matrices
@@ -59,7 +60,7 @@ def make_demo(
     angles = {s: _wrist_angle(clip, s, palm[s]) for s in hands}
     return HumanDemo(
         name=name,
-        fps=float(np.asarray(clip["fps"])),
+        fps=number(clip["fps"], what=f"{file}: fps"),
         keypoints=keypoints,
         palm=palm,
         objects=bodies + further,
@@ -72,8 +73,9 @@ def make_demo(
 
 
 def _keypoints(clip: dict[str, Any], side: Side, file: Path) -> np.ndarray:
-    joints = np.asarray(clip[f"mano_{side}_joints"], dtype=np.float64)
-    wrist = np.asarray(clip.get(f"mano_{side}_wrist_pos", ()), dtype=np.float64)
+    what = f"{file}: mano_{side}"
+    joints = numbers(clip[f"mano_{side}_joints"], what=f"{what}_joints")
+    wrist = numbers(clip.get(f"mano_{side}_wrist_pos", ()), what=f"{what}_wrist_pos")
     if joints.shape[1:] != (20, 3) or wrist.shape != (len(joints), 3):
         raise DemoError(
             f"{file}: mano_{side}_joints {joints.shape} and mano_{side}_wrist_pos "
@@ -96,7 +98,9 @@ def _wrist_angle(clip: dict[str, Any], side: Side, palm: np.ndarray) -> float | 
 
     Some ten degrees in sound clips; it is told, not judged.
     """
-    stored = np.asarray(clip.get(f"mano_{side}_wrist_rot", ()), dtype=np.float64)
+    stored = numbers(
+        clip.get(f"mano_{side}_wrist_rot", ()), what=f"mano_{side}_wrist_rot"
+    )
     if stored.shape != (len(palm), 3, 3):
         return None
     seen = np.isfinite(palm).all(-1) & np.isfinite(stored).all(axis=(1, 2))
@@ -118,9 +122,11 @@ def _objects(
     for side in hands:
         if f"obj_{side}_pose" not in clip or f"obj_{side}_id" not in clip:
             continue
-        name = str(np.asarray(clip[f"obj_{side}_id"]).item())
-        scale = float(np.asarray(clip.get(f"obj_{side}_scale", 1.0)))
-        matrices = np.asarray(clip[f"obj_{side}_pose"])
+        name = word(clip[f"obj_{side}_id"], what=f"{file}: obj_{side}_id")
+        scale = number(
+            clip.get(f"obj_{side}_scale", 1.0), what=f"{file}: obj_{side}_scale"
+        )
+        matrices = numbers(clip[f"obj_{side}_pose"], what=f"{file}: obj_{side}_pose")
         pose, repairs = poses_from_matrices(matrices, what=f"{file}: obj_{side}_pose")
         notes |= {f"obj_{side}_scale": scale} if scale != 1.0 else {}
         notes |= {f"obj_{side}_repairs": repairs} if repairs else {}

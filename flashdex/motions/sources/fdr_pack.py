@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
+from flashdex.motions.sources.entries import number, numbers
 from flashdex.motions.tracks import VELOCITY_SIGMA
 from flashdex.motions.unpickle import load_torch
 
@@ -90,7 +91,11 @@ def _object(
         )
     # two names of the same list are in use
     scales = pack.get(f"{side}_object_mesh_scales", pack.get(f"{side}_object_scales"))
-    scale = 1.0 if scales is None or not len(scales) else float(scales[slot])
+    scale = (
+        1.0
+        if scales is None or not len(scales)
+        else number(scales[slot], what=f"{file}: scale of {dirs[slot]}")
+    )
     return {
         f"obj_{side}_pose": pose,
         f"obj_{side}_id": Path(str(dirs[slot])).name,
@@ -102,7 +107,7 @@ def _rows(pack: dict[str, Any], key: str, start: int, end: int, file: Path) -> A
     if key not in pack or not 0 <= start < end <= len(pack[key]):
         has = f"{len(pack[key])} rows" if key in pack else "no such array"
         raise DemoError(f"{file}: rows {start} to {end} of {key} are wanted; {has}.")
-    return np.asarray(pack[key][start:end], dtype=np.float64)
+    return numbers(pack[key][start:end], what=f"{file}: {key}")
 
 
 def _rate(

@@ -10,6 +10,7 @@ import numpy as np
 
 from flashdex.errors import DemoError
 from flashdex.motions.demo import DemoObject
+from flashdex.motions.sources.entries import numbers, words
 from flashdex.motions.sources.mesh_files import scaled_mesh
 from flashdex.motions.sources.rigid import poses_from_matrices
 
@@ -34,7 +35,10 @@ def support_height(
     """
     if "support_disks" not in clip:
         return None, "no support_disks in the file: estimated from objects at rest"
-    disks = np.asarray(clip["support_disks"], dtype=np.float64).reshape(-1, 5)
+    disks = numbers(clip["support_disks"], what="support_disks")
+    if disks.size % 5:
+        raise DemoError(f"support_disks has shape {disks.shape}; expected (K, 5).")
+    disks = disks.reshape(-1, 5)
     tops = []
     for x, y, top, radius, _ in disks[np.isfinite(disks).all(-1) & (disks[:, 3] > 0)]:
         ends = np.concatenate([pose[[0, -1], :2] for pose in poses])
@@ -68,13 +72,16 @@ def context_objects(
     """
     if "desk_context_ids" not in clip or "desk_context_poses" not in clip:
         return [], {}
-    names = [str(name) for name in np.atleast_1d(clip["desk_context_ids"])]
-    tracks = np.asarray(clip["desk_context_poses"], dtype=np.float64)
+    names = words(clip["desk_context_ids"])
+    tracks = numbers(clip["desk_context_poses"], what=f"{file}: desk_context_poses")
     if len(tracks) != len(names):
         raise DemoError(
             f"{file}: desk_context_poses has {len(tracks)} tracks for {len(names)} ids."
         )
-    scales = np.atleast_1d(clip.get("desk_context_scales", np.ones(len(names))))
+    scales = clip.get("desk_context_scales", np.ones(len(names)))
+    scales = numbers(scales, what=f"{file}: desk_context_scales").ravel()
+    if len(scales) != len(names):
+        raise DemoError(f"{file}: {len(scales)} scales for {len(names)} context ids.")
     start = _place(dict(zip(names, tracks, strict=True)), held)
     others = [i for i, name in enumerate(names) if name not in {b.name for b in held}]
     if start is None:

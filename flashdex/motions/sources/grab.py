@@ -31,6 +31,7 @@ from flashdex.motions.sources.axis_angle import (
     same_length,
     track,
 )
+from flashdex.motions.sources.entries import number, word
 from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame, rotation
 from flashdex.motions.unpickle import load_npz
@@ -139,8 +140,8 @@ def read_sequence(sequence: GrabSequence) -> list[HumanDemo]:
     pose, mesh = _read_body(sequence, data, "object")
     lengths = {f"{side} hand": len(track) for side, track in keypoints.items()}
     frames = same_length(lengths | {"object": len(pose)}, where=where)
-    name = str(np.asarray(data.get("obj_name", sequence.object)).item())
-    fps = float(np.asarray(data.get("framerate", FPS)).item())
+    name = word(data.get("obj_name", sequence.object), what=f"{where}: obj_name")
+    fps = number(data.get("framerate", FPS), what=f"{where}: framerate")
     height, decision = _support(sequence, data)
     return [
         HumanDemo(
@@ -153,7 +154,7 @@ def read_sequence(sequence: GrabSequence) -> list[HumanDemo]:
             licence=GRAB.licence,
             support_z=height,
             split=sequence.split,
-            task=str(np.asarray(data.get("motion_intent", "")).item()),
+            task=word(data.get("motion_intent", ""), what=f"{where}: motion_intent"),
             provenance={
                 "files": [relative(f, sequence.root) for f in sequence.files()],
                 "fps": fps,
@@ -176,7 +177,7 @@ def _read_hand(sequence: GrabSequence, data: dict[str, Any], side: Side) -> np.n
     if "fullpose" in params:
         fingers = track(params, "fullpose", 45, where=where)
     else:
-        width = int(np.asarray(data.get("n_comps", 24)).item())
+        width = int(number(data.get("n_comps", 24), what=f"{where}: n_comps"))
         coefficients = track(params, "hand_pose", width, where=where)
         fingers = model.finger_pose(coefficients, flat=True)
     same_length(

@@ -20,6 +20,7 @@ POSE_HEADER = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m]"
 POSE_COLUMNS = (*POSE_HEADER.split(","), "q_wo_w", "q_wo_x", "q_wo_y", "q_wo_z")
 MASK_COLUMNS = ("timestamp[ns]", "stream_id", "mask")
 HAND_IDS: dict[str, Side] = {"0": "left", "1": "right"}
+MAX_STAMP = 1 << 62  # ns
 # what JSON of another layout, or nested too deep, raises
 BROKEN_JSON = (
     *(ValueError, KeyError, TypeError, AttributeError),
@@ -68,7 +69,7 @@ def read_poses(file: Path) -> dict[str, Track]:
     rows: dict[str, list[tuple[int, list[float]]]] = {}
     for line, (uid, time, *pose) in _table(file, POSE_COLUMNS):
         with _cells(file, line):
-            row = (int(time), [float(cell) for cell in pose])
+            row = (_stamp(time), [float(cell) for cell in pose])
         rows.setdefault(uid, []).append(row)
     return {uid: _track(found, 7) for uid, found in rows.items()}
 
@@ -80,7 +81,7 @@ def read_mask(file: Path) -> Mask | None:
     times, streams, values = [], [], []
     for line, (time, stream, value) in _table(file, MASK_COLUMNS):
         with _cells(file, line):
-            times.append(int(time))
+            times.append(_stamp(time))
             values.append({"true": True, "false": False}[value.strip().lower()])
         streams.append(stream)
     order = np.argsort(np.array(times, dtype=np.int64), kind="stable")
@@ -110,12 +111,20 @@ def read_hands(file: Path, widths: dict[str, int]) -> dict[Side, Track]:
             continue
         with _cells(file, number):
             record = json.loads(line)
-            time = int(record["timestamp_ns"])
+            time = _stamp(record["timestamp_ns"])
             for key, hand in record["hand_poses"].items():
                 if hand is not None:
                     rows[HAND_IDS[key]].append((time, _hand_row(hand, widths)))
     width = WRIST + sum(widths.values())
     return {side: _track(found, width) for side, found in rows.items() if found}
+
+
+def _stamp(value: Any) -> int:
+    """A time, ns, that 64 bits hold."""
+    time = int(value)
+    if abs(time) > MAX_STAMP:
+        raise ValueError(f"a time stamp of {len(str(abs(time)))} digits")
+    return time
 
 
 def _hand_row(hand: dict[str, Any], widths: dict[str, int]) -> list[float]:
@@ -163,8 +172,13 @@ def read_lines(file: Path) -> list[str]:
 
 def _table(file: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and the cells of ``columns`` in this order."""
-    reader = csv.reader(read_lines(file))
-    header = [name.strip() for name in next(reader, [])]
+    try:
+        rows = list(csv.reader(read_lines(file)))
+    except csv.Error as error:
+        raise DemoError(
+            f"{file}: not a table of comma-separated cells: {error}."
+        ) from error
+    header = [name.strip() for name in rows[0]] if rows else []
     missing = [name for name in columns if name not in header]
     if missing:
         raise DemoError(
@@ -172,7 +186,7 @@ def _table(file: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str
             f"'{','.join(header)}'."
         )
     places = [header.index(name) for name in columns]
-    for line, row in enumerate(reader, start=2):
+    for line, row in enumerate(rows[1:], start=2):
         if row:
             with _cells(file, line):
                 if len(row) < len(header):

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from flashdex.errors import DemoError
+from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
-from flashdex.motions.meshes import hull_vertices
+from flashdex.motions.demo_support import demo_support
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources.entries import number, numbers
 from flashdex.motions.sources.roots import refuse_pointer
-from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame
 from flashdex.motions.unpickle import load_arrays
 
@@ -78,12 +78,12 @@ def read_file(file: Path) -> HumanDemo:
         lack = missing + ([] if hands else ["kp_left or kp_right"])
         raise DemoError(f"{file}: lacks {', '.join(lack)}. Found: {', '.join(data)}.")
     keypoints: dict[Side, np.ndarray] = {
-        s: data[f"kp_{s}"].astype(np.float64) for s in hands
+        s: numbers(data[f"kp_{s}"], what=f"{file}: kp_{s}") for s in hands
     }
     licence = file.parent / "LICENSE"
     return HumanDemo(
         name=file.stem,
-        fps=float(data["fps"]),
+        fps=number(data["fps"], what=f"{file}: fps"),
         keypoints=keypoints,
         palm={s: _read_palm(data, s, keypoints) for s in hands},
         objects=_read_objects(file, data),
@@ -96,7 +96,7 @@ def read_file(file: Path) -> HumanDemo:
 def _read_palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.ndarray:
     stored, points = data.get(f"palm_{side}"), keypoints[side]
     if stored is not None:
-        return stored.astype(np.float64)
+        return numbers(stored, what=f"palm_{side}")
     if points.ndim != 3 or points.shape[1:] != (21, 3):
         return np.full((len(points), 7), np.nan)  # validation says what is wrong
     return palm_frame(points, side)
@@ -105,7 +105,7 @@ def _read_palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.
 def _read_objects(file: Path, data: dict) -> list[DemoObject]:
     """One object with ``obj_pose`` (T, 7), or several with (T, N, 7)."""
     names = [str(name) for name in np.atleast_1d(data["object"])]
-    poses = data["obj_pose"].astype(np.float64)
+    poses = numbers(data["obj_pose"], what=f"{file}: obj_pose")
     if poses.ndim == 2:
         poses = poses[:, None]
     if poses.ndim != 3 or poses.shape[1] != len(names):
@@ -166,13 +166,10 @@ def _cut(demo: HumanDemo, pieces: list[tuple[int, int]]) -> list[HumanDemo]:
 
 def _support(demo: HumanDemo) -> float | None:
     try:
-        demo.validate()
-    except DemoError:
-        return None  # each piece is validated on its own; some may be sound
-    vertices = [hull_vertices(b.load_mesh()) for b in demo.objects]
-    poses = [b.pose for b in demo.objects]
-    height, found = estimate_support(poses, vertices, demo.fps)
-    return height if found else None
+        demo.validate(complete=False)
+        return demo_support(demo)
+    except (DemoError, MeshError):
+        return None  # each piece is judged on its own; some may be sound
 
 
 KEYPOINTS = Source(

@@ -129,8 +129,11 @@ def _mesh_file(clip: Path) -> Path:
 
 def _origin(root: Path) -> dict[str, str]:
     """Package and hash of the fetched folder; nothing for a folder made by hand."""
+    file = root / "source.json"
     try:
-        stored = json.loads((root / "source.json").read_text(encoding="utf-8"))
+        if not file.is_file():
+            return {}
+        stored = json.loads(file.read_text(encoding="utf-8"))
         return {"package": str(stored["source"]), "sha256": str(stored["sha256"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}

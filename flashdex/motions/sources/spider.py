@@ -20,6 +20,7 @@ from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.recording import Recording, Source, SourceOptions
+from flashdex.motions.sources.entries import number, numbers
 from flashdex.motions.sources.roots import refuse_clone
 from flashdex.motions.sources.spider_hand import fill_hand
 from flashdex.motions.sources.spider_scene import (
@@ -105,7 +106,7 @@ def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
             f"left, with tips apart; found: {', '.join(sorted(data))}."
         )
     bodies = read_objects(data, file, info, objects)
-    step = float(info.get("ref_dt") or 1 / FPS)
+    step = number(info.get("ref_dt") or 1 / FPS, what=f"{info_file}: ref_dt")
     if not step > 0:
         raise DemoError(f"{info_file}: ref_dt is {step}; it must be positive, seconds.")
     pip = any(f"qpos_pip_{side}" in data for side in keypoints)
@@ -135,8 +136,8 @@ def _read_hand(
 ) -> tuple[np.ndarray, dict[str, Any]] | None:
     if f"qpos_finger_{side}" not in data or f"qpos_wrist_{side}" not in data:
         return None
-    wrist = np.asarray(data[f"qpos_wrist_{side}"], dtype=np.float64)
-    finger = np.asarray(data[f"qpos_finger_{side}"], dtype=np.float64)
+    wrist = numbers(data[f"qpos_wrist_{side}"], what=f"{file}: qpos_wrist_{side}")
+    finger = numbers(data[f"qpos_finger_{side}"], what=f"{file}: qpos_finger_{side}")
     if finger.ndim != 3 or finger.shape[1:] != (5, 7) or wrist.shape[1:] != (7,):
         raise DemoError(
             f"{file}: qpos_finger_{side} {finger.shape} and qpos_wrist_{side} "

@@ -12,6 +12,7 @@ import numpy as np
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import QUAT_TOLERANCE, DemoObject
+from flashdex.motions.sources.entries import numbers
 from flashdex.motions.sources.mesh_files import find_mesh, mesh_in
 from flashdex.motions.tracks import FARTHEST
 
@@ -27,7 +28,7 @@ def read_objects(
         folder = info.get(f"{side}_object_mesh_dir")
         if not folder or f"qpos_obj_{side}" not in data:
             continue
-        stored = np.asarray(data[f"qpos_obj_{side}"], dtype=np.float64)
+        stored = numbers(data[f"qpos_obj_{side}"], what=f"{file}: qpos_obj_{side}")
         if stored.ndim != 2 or stored.shape[1] != 7:
             raise DemoError(f"{file}: qpos_obj_{side} {stored.shape}; expected (T, 7).")
         pose = pose_track(stored, f"{file}: qpos_obj_{side}")

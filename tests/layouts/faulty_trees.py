@@ -70,9 +70,11 @@ def _array(value):
 
 
 def _listed(value):
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    return value if not isinstance(value, (complex, bytes)) else str(value)
+    if not hasattr(value, "tolist"):
+        return str(value)
+    listed = value.tolist()
+    plain = isinstance(listed, (int, float, str, list))
+    return listed if plain else str(listed)
 
 
 def change_part(tree, rng, change):
@@ -141,7 +143,7 @@ def revalue(value, rng):
     with np.errstate(all="ignore"):
         values = [array * np.nan, array * 0, array * 1e30, array * 1e308, -array]
         values += [array * 1000, array * 1e-3, array + 1e6, np.full_like(array, np.inf)]
-        values += [rng.normal(size=array.shape), rng.permutation(array)]
+        values += [rng.normal(size=array.shape), array[..., ::-1] if array.ndim else 7]
     return _like(value, values[rng.integers(len(values))])
 
 

@@ -58,8 +58,8 @@ def test_hands_that_come_late_are_flagged(demo, late, wanted):
     ("edit", "wanted"),
     [
         (lambda p: p, []),
-        (lambda p: p + [500.0, 0, 0], []),
-        (lambda p: p + [5000.0, 0, 0], ["reject"]),
+        (lambda p: p + np.array([500.0, 0, 0]), []),
+        (lambda p: p + np.array([5000.0, 0, 0]), ["reject"]),
         (lambda p: 12 * p, ["warn"]),
         (lambda p: 1000 * p, ["reject"]),
     ],

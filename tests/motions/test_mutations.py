@@ -31,13 +31,16 @@ from flashdex.motions.process import MotionSettings, make_targets
 from flashdex.motions.recording import SourceOptions
 from flashdex.motions.sources import list_recordings
 
+# writers of layouts compute with numbers that are none; that is not what is tested
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:layouts")
 # convex parts of a torn mesh take CoACD a minute; the hull serves these tests
 QUICK = ObjectSettings(sdf_resolution=24, max_parts=1)
 LIMIT = 60  # s; a case that needs longer waits for something that never comes
 ALL = all_cases()
 FEW, MANY = 36, 3  # one case in so many
 LIES = [case for case in ALL if case.lies]
-# What no check of the recording itself can see, by the name of the mutation.
+# What no check of the recording itself can see, by the name of the mutation (or of the
+# case): the recording that comes of it could have been made.
 UNSEEN = {
     # a hand that carries slowly looks like one that carries; only a fall would tell
     "change_rate_0.25": "slow motion is a possible motion",
@@ -50,8 +53,9 @@ UNSEEN = {
     "swap_poses": "two alike objects in each other's place",
     # the mistake of a rest wrist that is left out (9 cm); on a smaller object it shows
     "shift_hands_0.1": "a hand beside its place still touches a box of 8 cm",
+    # its one object slides sideways then, and nothing says where the table is
+    "arctic-lay_world_down": "an object may slide over a table and back",
     "delay_hands_6": "0.05 s to 0.2 s late is within what recordings have",
-    "delay_hands_20": "0.17 s late at 120 frames a second, as above",
 }
 
 
@@ -128,7 +132,7 @@ def check(case, run, folder):
         assert (outcome.record is None) == (status == "rejected")
         if outcome.record is not None:
             check_record(outcome.record, status)
-            if case.lies and case.name not in UNSEEN:
+            if case.lies and not {case.name, str(case)} & set(UNSEEN):
                 assert status == "flagged", f"{case} passes as sound"
 
 
@@ -157,7 +161,8 @@ def test_there_are_enough_mutations():
     assert len(names) == len(set(names)) > 1000
     assert {case.layout for case in every(ALL, FEW)} == set(LAYOUTS)
     assert len(every(ALL, MANY)) > 600
-    assert {case.name for case in LIES} >= set(UNSEEN)
+    lies = {case.name for case in LIES} | {str(case) for case in LIES}
+    assert lies >= set(UNSEEN)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -222,7 +227,7 @@ def test_library_holds_only_the_good_ones(tmp_path):
         "untracked": ((spoil_objects, ("all", np.nan)), None),
         "millimetres": ((scale_poses, (1000,)), None),
         "swapped": ((swap_sides, ()), None),
-        "=cmd|'/c calc'!A1": (None, truncate),
+        "=cmd|' calc'!A1": (None, truncate),
         "two\nlines": (None, truncate),
         "climbing": (None, name_object("../../climbed")),
         "absolute": (None, name_object(str(tmp_path / "absolute"))),

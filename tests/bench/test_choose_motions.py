@@ -26,9 +26,8 @@ def row(name, depth, status="kept"):
 
 
 def scores(**passed):
-    motions = dict.fromkeys("abcde", [])
     return {
-        name: {m: {"passed": passed.get(name, {}).get(m, [])} for m in motions}
+        name: {m: {"passed": passed.get(name, {}).get(m, [])} for m in "abcde"}
         for name in ("do_nothing", "frozen_object", "kinematic_playback")
     }
 

@@ -7,6 +7,7 @@ rows from ``length_starts[i]``. Which object a clip uses stands in
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ REQUIRED = ("motion_num_frames", "length_starts", "motion_filename")
 def pack_names(file: Path) -> list[str]:
     """Names of the clips; a repeated name gets its row."""
     names = [Path(str(name)).stem for name in _open(file)["motion_filename"]]
-    return [n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names)]
+    count = Counter(names)
+    return [n if count[n] == 1 else f"{n}_{i}" for i, n in enumerate(names)]
 
 
 def pack_objects(file: Path) -> list[str]:

@@ -89,8 +89,9 @@ class GrabSequence:
 
     def files(self) -> list[Path]:
         """Every file that it depends on and that exists."""
-        folder = self.models or self.root / TOOLS / MESHES
-        meshes = [folder / f"{name}.ply" for name in (self.object, "table")]
+        folders = [self.root / TOOLS / MESHES, *([self.models] if self.models else [])]
+        names = (f"{self.object}.ply", "table.ply")
+        meshes = [folder / name for folder in folders for name in names]
         people = self.root / TOOLS / "subject_meshes"
         hands = sorted(people.glob(f"*/{self.file.parent.name}_[lr]hand.ply"))
         return [file for file in (self.file, *meshes, *hands) if file.is_file()]

@@ -78,7 +78,7 @@ def list_hot3d(options: SourceOptions) -> list[Recording]:
             name=folder.name,
             read=partial(read_sequence, folder, root, library, mano),
             files=(*_sequence_files(folder), *_library_files(folder, library), *models),
-            key=library.key(),
+            key=f"{folder.parent.name} {library.key()}",  # the split is a folder
         )
         for folder in folders
     ]

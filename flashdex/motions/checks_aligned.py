@@ -132,7 +132,7 @@ def _tip_depth(aligned: AlignedDemo, sdf: SdfGrid) -> float:
 def _check_support(aligned: AlignedDemo, vertices: list[np.ndarray]) -> list[Finding]:
     found = []
     if not aligned.support_found:
-        text = "nothing rests; the table is where the lowest vertex was"
+        text = "nothing rests (are quaternions wxyz?); table at the lowest vertex"
         found.append(Finding("W_SUPPORT", "warn", text))
     for name, pose, points in zip(
         aligned.object_names, aligned.poses, vertices, strict=True

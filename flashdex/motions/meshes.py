@@ -123,10 +123,14 @@ def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
         raise MeshError(f"{name}: {distinct} distinct vertices; a solid needs 4.")
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        unit = "millimetres: scale by 0.001" if extent > MAX_EXTENT else "another unit"
+        hint = (
+            "Are they centimetres (scale by 0.01) or millimetres (0.001)?"
+            if extent > MAX_EXTENT
+            else "Are they of another unit?"
+        )
         raise MeshError(
             f"{name}: the mesh is {extent:.4g} m long; allowed are {MIN_EXTENT} m to "
-            f"{MAX_EXTENT} m. Vertices must be metres; these look like {unit}."
+            f"{MAX_EXTENT} m. Vertices must be metres. {hint}"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -50,8 +51,13 @@ def run_jobs(
     else:
         stream = ((i, run_job(job)) for i, job in enumerate(queue))
     outcomes: dict[int, Outcome] = {}
-    for place, outcome in _show(stream, len(jobs), progress):
-        outcomes[order[place]] = outcome
+    try:
+        for place, outcome in _show(stream, len(jobs), progress):
+            outcomes[order[place]] = outcome
+    except KeyboardInterrupt:
+        told = f"stopped: {len(outcomes)} of {len(jobs)} recordings are in the cache"
+        _LOG.info("%s; the same command goes on from there", told)
+        raise
     return [outcomes[i] for i in range(len(jobs))]
 
 
@@ -105,6 +111,9 @@ def _run_pool(
             suspects += running.values()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            # a worker inside a mesh library would keep the user waiting for a minute
+            for worker in multiprocessing.active_children():
+                worker.terminate()
             raise
 
 
@@ -113,9 +122,12 @@ def _pool(workers: int) -> ProcessPoolExecutor:
         os.environ.setdefault(name, "1")  # read by the libraries when they load
     # spawn: a fork of a process that runs torch threads can hang
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(
-        workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)
-    )
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to answer
+    torch.set_num_threads(1)
 
 
 def _show(

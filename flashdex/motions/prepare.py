@@ -7,6 +7,7 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import logging
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,12 +15,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from flashdex.errors import LibraryError
+from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
 from flashdex.motions.jobs import Job, Outcome
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.motion_cache import content_hash
+from flashdex.motions.motion_cache import cache_file, content_hash
 from flashdex.motions.objects import ObjectSettings, default_cache_dir
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.process import MotionSettings
@@ -28,6 +29,8 @@ from flashdex.motions.residuals import RetargetWeights
 from flashdex.motions.sources import list_recordings
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
+_LOG = logging.getLogger(__name__)
+
 PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
 
@@ -152,6 +155,7 @@ def run_order(
     load_hand(settings.hand)  # refuses an unknown name before anything is read
     recordings, doubles = _without_doubles(order.recordings())
     jobs = [Job(recording, settings) for recording in recordings]
+    _tell_start(jobs, workers)
     outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.rows] + doubles
     manifest = _facts(order, rows)
@@ -161,6 +165,21 @@ def run_order(
         writer.add(record)
     _refuse_empty(rows, out)
     return MotionLibrary.load(writer.write(report=make_report(rows)))
+
+
+def _tell_start(jobs: list[Job], workers: int) -> None:
+    if workers < 1:
+        raise DemoError(f"--workers is {workers}; at least 1 is needed.")
+    root = jobs[0].settings.cache_dir or default_cache_dir()
+    known = 0
+    for job in jobs:
+        with suppress(OSError):
+            known += cache_file(job.recording, job.settings, root).is_file()
+    left = len(jobs) - known
+    text = f"{known} of {len(jobs)} recordings are in the cache {root}"
+    _LOG.info(
+        "%s%s", text, f"; a new mesh can take a minute: {left} to do" * (left > 0)
+    )
 
 
 def hash_inputs(order: Order) -> str:

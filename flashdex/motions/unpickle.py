@@ -127,7 +127,8 @@ def load_arrays(
     for name, array in entries.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind == "O":
             raise DemoError(
-                f"{path}: not a readable .npz without pickles: '{name}' holds objects."
+                f"{path}: not a readable .npz without pickles: '{name}' holds objects. "
+                f"Store plain arrays; text as np.array([...], dtype=str)."
             )
     return entries
 

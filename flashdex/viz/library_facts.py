@@ -30,7 +30,7 @@ CODES = {
     "E_LEN": "hands and objects have different numbers of frames",
     "E_MANO": "MANO files missing, wrong, or sides swapped",
     "E_MESH": "mesh missing, unreadable or without volume",
-    "E_NAN": "values missing for too long",
+    "E_NAN": "frames not tracked: filled, cut around, or too many",
     "E_PICKLE": "the file asks for code to be run; it is not read",
     "E_READ": "the recording cannot be read",
     "E_ROOT": "expected folders are absent",

@@ -15,6 +15,10 @@ from flashdex.motions.sources.procedural import PROCEDURAL
 from flashdex.motions.sources.spider import SPIDER
 from flashdex.motions.sources.taco import TACO
 
+MANO_HINT = (
+    "MANO is the hand model of mano.is.tue.mpg.de (registration): give the folder with "
+    "MANO_LEFT.pkl and MANO_RIGHT.pkl."
+)
 SOURCES: dict[str, Source] = {
     "procedural": PROCEDURAL,
     "keypoints": KEYPOINTS,
@@ -45,8 +49,14 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     reader = SOURCES[source]
     missing = [name for name in reader.needs if getattr(options, name) is None]
     if missing:
-        told = ", ".join("--input" if m == "path" else f"--{m}" for m in missing)
-        raise DemoError(f"{source}: {told} is missing. It reads {reader.about}")
+        words = ["--input" if m == "path" else f"--{m}" for m in missing]
+        hint = f" {MANO_HINT}" if "mano" in missing else ""
+        raise DemoError(
+            f"{source}: give {' and '.join(words)}. It reads {reader.about}.{hint}"
+        )
+    made_up = source == "procedural"  # its input is a word
+    if options.path is not None and not made_up and not options.path.exists():
+        raise DemoError(f"{source}: no such file or folder: {options.path}")
     if options.limit is not None and options.limit < 1:
         raise DemoError(f"{source}: --limit is {options.limit}; at least 1 is needed.")
     try:

@@ -25,6 +25,10 @@ from flashdex.motions.sources.roots import refuse_pointer
 from flashdex.motions.tracks import palm_frame
 from flashdex.motions.unpickle import load_arrays
 
+KEYS = (
+    *("fps", "object", "obj_pose"),
+    *("kp_left", "kp_right", "palm_left", "palm_right"),
+)
 REQUIRED = ("fps", "object", "obj_pose")
 SOURCE = "keypoints"
 
@@ -71,7 +75,7 @@ def read_keypoints(path: str | Path) -> list[HumanDemo]:
 
 def read_file(file: Path) -> HumanDemo:
     """One recording, uncut."""
-    data = load_arrays(file)
+    data = load_arrays(file, only=KEYS)
     missing = [key for key in REQUIRED if key not in data]
     hands: list[Side] = [side for side in SIDES if f"kp_{side}" in data]
     if missing or not hands:

@@ -177,9 +177,8 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
             known += cache_file(job.recording, job.settings, root).is_file()
     left = len(jobs) - known
     text = f"{known} of {len(jobs)} recordings are in the cache {root}"
-    _LOG.info(
-        "%s%s", text, f"; a new mesh can take a minute: {left} to do" * (left > 0)
-    )
+    more = f", {left} to do; a new mesh can take a minute" if left else ""
+    _LOG.info("%s%s", text, more)
 
 
 def hash_inputs(order: Order) -> str:

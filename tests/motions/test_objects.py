@@ -355,7 +355,7 @@ FLAT = [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]]
         (triangles(FLAT[:3], [[0, 1, 2]]), "3 distinct vertices"),
         (triangles(NAN, BOX.faces), "1 vertices are not finite"),
         (triangles(FLAT, [[0, 1, 2], [0, 2, 3]]), "no volume"),
-        (trimesh.creation.box(extents=(40, 60, 100)), "millimetres: scale by 0.001"),
+        (trimesh.creation.box(extents=(40, 60, 100)), "centimetres"),
         (trimesh.creation.box(extents=(1e-4, 1e-4, 1e-3)), "another unit"),
     ],
     ids=["empty", "vertices", "nan", "flat", "too-large", "too-small"],

@@ -90,7 +90,7 @@ def test_seed_decides(tmp_path, cache, library):
 def test_bad_input_is_refused_before_work(tmp_path):
     with pytest.raises(UnknownSourceError, match="Did you mean 'procedural'"):
         prepare("procedual", out=tmp_path / "lib")
-    with pytest.raises(DemoError, match="--input is missing"):
+    with pytest.raises(DemoError, match="give --input"):
         prepare("keypoints", out=tmp_path / "lib")
     with pytest.raises(DemoError, match=r"no \.npz recordings"):
         prepare("keypoints", tmp_path, out=tmp_path / "lib")

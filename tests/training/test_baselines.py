@@ -18,8 +18,8 @@ def test_table_counts_motions_by_criterion():
     }
     lines = format_baselines(Baselines(rows)).splitlines()
     assert lines[0].startswith("motions of 2 that pass")
-    assert lines[2].split() == ["criterion", "do_nothing", "frozen_object"]
-    table = {line.split()[0]: line.split()[1:] for line in lines[3:]}
+    assert lines[3].split() == ["criterion", "do_nothing", "frozen_object"]
+    table = {line.split()[0]: line.split()[1:] for line in lines[4:]}
     assert table["sr_mt_obj"] == ["1", "2"]
     assert table["sr_mt"] == ["0", "0"]
     assert not any(name.endswith("_left") for name in table)

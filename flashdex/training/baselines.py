@@ -121,8 +121,8 @@ def format_baselines(baselines: Baselines) -> str:
     names = list(baselines.rows)
     total = len(next(iter(baselines.rows.values())))
     lines = [
-        f"motions of {total} that pass without learning. do_nothing: the hand holds its",
-        "first pose; kinematic_playback: it follows the reference; frozen_object: the",
+        f"of {total} motions, how many pass without learning. do_nothing holds the",
+        "first pose, kinematic_playback follows the reference; with frozen_object the",
         "object never moves",
         f"{'criterion':<24}" + "".join(f"{n:>20}" for n in names),
     ]

@@ -120,16 +120,6 @@ def _add_run_verbs(
         "--cfg", choices=["job"], help="print the composed recipe and stop"
     )
 
-    verb = add("baselines", _baselines, "score what no learning achieves")
-    verb.add_argument("recipe", help="name or path: its motions and physics")
-    verb.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="key=value",
-        help="changes, e.g. motions.library=libraries/mine",
-    )
-    verb.add_argument("--out", type=Path, help="JSON file for every score")
-
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
     verb.add_argument("run_dir", type=Path, metavar="RUN")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
@@ -182,19 +172,6 @@ def _validate(args: argparse.Namespace) -> int:
 
     for path in validate_paths(args.paths):
         print(f"ok  {path}")
-    return 0
-
-
-def _baselines(args: argparse.Namespace) -> int:
-    from flashdex.recipe import Recipe, compose, expect_kind
-    from flashdex.training.baselines import format_baselines, score_baselines
-    from flashdex.training.setup import open_workbench
-
-    recipe = compose(args.recipe, args.overrides)
-    bench = open_workbench(expect_kind(recipe, Recipe, where="baselines"))
-    if args.out is not None:
-        args.out.unlink(missing_ok=True)  # scores of another time are no answer
-    print(format_baselines(score_baselines(bench, args.out)))
     return 0
 
 

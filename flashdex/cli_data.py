@@ -1,4 +1,4 @@
-"""The verbs of `flashdex` that make data: fetch, prepare."""
+"""The verbs of `flashdex` about data: fetch, prepare, baselines."""
 
 from __future__ import annotations
 
@@ -61,6 +61,16 @@ def add_data_verbs(
         "--dry-run", action="store_true", help="list the recordings and stop"
     )
 
+    verb = add("baselines", _baselines, "score what no learning achieves")
+    verb.add_argument("recipe", help="name or path: its motions and physics")
+    verb.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="key=value",
+        help="changes, e.g. motions.library=libraries/mine",
+    )
+    verb.add_argument("--out", type=Path, help="JSON file for every score")
+
 
 def _fetch(args: argparse.Namespace) -> int:
     from flashdex.motions.fetch import NOTE, fetch
@@ -122,4 +132,17 @@ def _list_recordings(args: argparse.Namespace) -> int:
         name = "".join(c if c.isprintable() else "?" for c in recording.name)
         print(f"{name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
     print(f"{len(recordings)} recordings")
+    return 0
+
+
+def _baselines(args: argparse.Namespace) -> int:
+    from flashdex.recipe import Recipe, compose, expect_kind
+    from flashdex.training.baselines import format_baselines, score_baselines
+    from flashdex.training.setup import open_workbench
+
+    recipe = compose(args.recipe, args.overrides)
+    bench = open_workbench(expect_kind(recipe, Recipe, where="baselines"))
+    if args.out is not None:
+        args.out.unlink(missing_ok=True)  # scores of another time are no answer
+    print(format_baselines(score_baselines(bench, args.out)))
     return 0

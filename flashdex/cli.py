@@ -14,10 +14,8 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flashdex.cli_data import add_data_verbs
+from flashdex.cli_data import Handler, add_data_verbs
 from flashdex.errors import FlashdexError
-
-Handler = Callable[[argparse.Namespace], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

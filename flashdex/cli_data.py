@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flashdex.errors import FlashdexError
+
+if TYPE_CHECKING:  # the command line starts fast: heavy parts load in their verb
+    from flashdex.motions.prepare import Order
 
 Handler = Callable[[argparse.Namespace], int]
 
@@ -83,39 +87,25 @@ def _fetch(args: argparse.Namespace) -> int:
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from flashdex.motions.prepare import prepare
+    from flashdex.motions.prepare import run_order
     from flashdex.viz.library_report import summary_lines, write_library_report
 
+    order = _order(args)
     if args.dry_run:
-        return _list_recordings(args)
+        return _list_recordings(order)
     if args.out is None:
         raise FlashdexError("give --out: the folder of the library")
-    library = prepare(
-        source=args.source,
-        input=args.input,
-        hand=args.hand,
-        out=args.out,
-        control_hz=args.hz,
-        workers=args.workers,
-        ray=args.ray,
-        limit=args.limit,
-        seed=args.seed,
-        mano=args.mano,
-        models=args.models,
-        splits=args.splits,
-        cut=args.cut,
-        speed=args.speed,
-        strict=args.strict,
-    )
+    library = run_order(order, args.out, workers=args.workers, ray=args.ray)
     report = write_library_report(library, thumbnails=not args.no_thumbnails)
     print("\n".join(summary_lines(library)))
     print(f"{library.path}: figures in report.csv, pictures in {report}")
     return 0
 
 
-def _list_recordings(args: argparse.Namespace) -> int:
+def _order(args: argparse.Namespace) -> Order:
+    from flashdex.motions.prepare import Order
+    from flashdex.motions.process import MotionSettings
     from flashdex.motions.recording import SourceOptions
-    from flashdex.motions.sources import list_recordings
 
     options = SourceOptions(
         path=args.input,
@@ -125,7 +115,18 @@ def _list_recordings(args: argparse.Namespace) -> int:
         seed=args.seed,
         limit=args.limit,
     )
-    recordings = list_recordings(args.source, options)
+    settings = MotionSettings(
+        hand=args.hand,
+        control_hz=args.hz,
+        cut=args.cut,
+        speed=args.speed,
+        strict=args.strict,
+    )
+    return Order(args.source, options, settings)
+
+
+def _list_recordings(order: Order) -> int:
+    recordings = order.recordings()
     for recording in recordings:
         size = sum(file.stat().st_size for file in recording.files)
         # a name must neither steer the terminal nor be half a character

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.keys import TIP_KEYPOINTS
+from flashdex.motions.activity import MOVE_TRAVEL, MOVE_TURN, motion_of
 from flashdex.motions.align import AlignedDemo
 from flashdex.motions.checks import Finding, reject
 from flashdex.motions.checks_objects import check_objects, check_overlap
 from flashdex.motions.gravity import Up, check_up
+from flashdex.motions.meshes import hull_vertices
 from flashdex.motions.objects import ObjectAsset
 from flashdex.motions.penetration import Penetration
 from flashdex.motions.support import lowest_points, runs, still_runs
@@ -19,7 +23,6 @@ from flashdex.motions.tracks import rotation
 REACH = 1.0  # m
 CONTACT_NEAR = 0.02  # m
 ACTIVE_SECONDS = 0.3
-STATIC_TRAVEL, STATIC_TURN = 0.02, np.deg2rad(15)
 TIP_DEPTH = (0.01, 0.02)  # m, warn and reject
 BELOW, BELOW_LIMIT = 0.01, 0.05  # m, under the table
 IK_MEAN, IK_P95 = 0.02, 0.04  # m
@@ -42,7 +45,7 @@ def check_aligned(
     Returns:
         Findings, and figures for the report.
     """
-    travel, turn = _object_motion(aligned.poses)
+    travel, turn = _motions_of(aligned.poses)
     depth = _tip_depth(aligned, sdf)
     figures = {
         "frames": aligned.num_frames,
@@ -56,14 +59,14 @@ def check_aligned(
         "human_tip_depth_mm": round(1e3 * depth, 1),
     }
     found = check_objects(assets) + check_overlap(assets, aligned.poses, sdf)
-    moves = (travel > STATIC_TRAVEL) | (turn > STATIC_TURN)
+    moves = (travel > MOVE_TRAVEL) | (turn > MOVE_TURN)
     found += _check_contact(aligned, moves=bool(moves.any()))
     found += _check_left_out(aligned)
     if depth > TIP_DEPTH[0]:
         level = "reject" if depth > TIP_DEPTH[1] else "warn"
         text = f"a fingertip is {1e3 * depth:.0f} mm inside the object"
         found.append(Finding("W_PEN", level, text))
-    vertices = [np.asarray(mesh.convex_hull.vertices) for mesh in aligned.meshes]
+    vertices = [hull_vertices(mesh) for mesh in aligned.meshes]
     found += _check_support(aligned, vertices)
     return found + check_up(aligned.poses, vertices, aligned.fps, up=up), figures
 
@@ -92,8 +95,8 @@ def _check_left_out(aligned: AlignedDemo) -> list[Finding]:
     """Objects for which there is no slot: harmless only while they lie still."""
     if not aligned.left_out:
         return []
-    travel, turn = _object_motion(list(aligned.left_out.values()))
-    moves = (travel > STATIC_TRAVEL) | (turn > STATIC_TURN)
+    travel, turn = _motions_of(aligned.left_out.values())
+    moves = (travel > MOVE_TRAVEL) | (turn > MOVE_TURN)
     names = np.array(list(aligned.left_out))
     found = []
     if moves.any():
@@ -105,14 +108,10 @@ def _check_left_out(aligned: AlignedDemo) -> list[Finding]:
     return found
 
 
-def _object_motion(poses: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _motions_of(poses: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Largest travel (m) and turn (rad) from the first frame, per object."""
-    travel, turn = [], []
-    for pose in poses:
-        travel.append(np.linalg.norm(pose[:, :3] - pose[0, :3], axis=-1).max())
-        rot = rotation(pose[:, 3:])
-        turn.append((rot * rot[0].inv()).magnitude().max())
-    return np.array(travel), np.array(turn)
+    travel, turn = np.array([motion_of(pose) for pose in poses]).T
+    return travel, turn
 
 
 def _tip_depth(aligned: AlignedDemo, sdf: SdfGrid) -> float:

@@ -17,7 +17,6 @@ from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions.checks import MAX_SECONDS, Finding, concerning
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
-from flashdex.motions.objects import default_cache_dir
 from flashdex.motions.process import MotionSettings, Prepared, prepare_motion, reject
 from flashdex.motions.recording import Recording
 from flashdex.motions.repair import repair
@@ -76,20 +75,21 @@ def run_job(job: Job, *, carry: bool = False) -> Outcome:
         job: the recording and how.
         carry: bring the motions along, for a caller that may not see this disk.
     """
-    root = job.settings.cache_dir or default_cache_dir()
+    root = job.settings.cache_root
     try:
-        file = cache_file(job.recording, job.settings, root)
+        file = cache_file(job.recording, job.settings)
     except OSError as error:
         rejected = _reject(job.recording.name, "E_FILE", f"cannot be read: {error}")
         return Outcome([rejected.row], None, [rejected])
     prepared = read_prepared(file, root)
+    is_kept = prepared is not None
     if prepared is None:
         prepared = prepare_recording(job.recording, job.settings)
         write_prepared(file, prepared)
+        # a disk that refuses the motions or their objects must not cost them
+        is_kept = not carry and read_prepared(file, root) is not None
     rows = [item.row for item in prepared]
-    # a disk that refuses the motions or their objects must not cost them
-    is_kept = not carry and read_prepared(file, root) is not None
-    return Outcome(rows, file, [] if is_kept else prepared)
+    return Outcome(rows, file, [] if is_kept and not carry else prepared)
 
 
 def crashed(job: Job) -> Outcome:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.keys import Side
+from flashdex.keys import SIDES, Side
 from flashdex.motions.unpickle import load_npz, load_pickle
 
 # below the folder that the user names, in this order
@@ -49,6 +49,16 @@ class ManoArrays:
     weights: np.ndarray
     mean: np.ndarray
     components: np.ndarray
+
+
+def mano_pair(folder: Path) -> tuple[Path, Path]:
+    """The model files of both hands, left first.
+
+    Raises:
+        DemoError: one of them is missing.
+    """
+    left, right = (mano_file(folder, side) for side in SIDES)
+    return left, right
 
 
 def mano_file(folder: Path, side: Side) -> Path:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import asdict
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -44,22 +43,21 @@ def content_hash(recording: Recording) -> str:
     return digest.hexdigest()
 
 
-def cache_file(recording: Recording, settings: MotionSettings, root: Path) -> Path:
+def cache_file(recording: Recording, settings: MotionSettings) -> Path:
     """Where the result of a recording is kept.
 
     Args:
         recording: listed.
-        settings: that it is prepared with.
-        root: of the cache.
+        settings: that it is prepared with; they name the cache too.
 
     Raises:
         OSError: a file of the recording cannot be read.
     """
-    chosen = asdict(settings)
-    chosen.pop("cache_dir")
-    facts = [recording.name, content_hash(recording), chosen, _code_hash()]
+    content = content_hash(recording)
+    facts = [recording.name, content, settings.facts(), _code_hash()]
     text = json.dumps(facts, sort_keys=True, default=str)
-    return root / "motions" / f"{hashlib.sha256(text.encode()).hexdigest()}.npz"
+    name = f"{hashlib.sha256(text.encode()).hexdigest()}.npz"
+    return settings.cache_root / "motions" / name
 
 
 @cache

@@ -11,7 +11,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +21,7 @@ from flashdex.motions.jobs import Job, Outcome
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.motion_cache import cache_file, content_hash
-from flashdex.motions.objects import ObjectSettings, default_cache_dir
+from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.process import MotionSettings
 from flashdex.motions.recording import Recording, SourceOptions
@@ -153,15 +153,16 @@ def run_order(
     """
     settings = order.settings
     load_hand(settings.hand)  # refuses an unknown name before anything is read
-    recordings, doubles = _without_doubles(order.recordings())
+    listed = order.recordings()
+    recordings, doubles = _without_doubles(listed)
     jobs = [Job(recording, settings) for recording in recordings]
     _tell_start(jobs, workers)
     outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.rows] + doubles
-    manifest = _facts(order, rows)
+    manifest = _facts(order, listed, rows)
     hand, fps = settings.hand, settings.control_hz
     writer = LibraryWriter(out, hand=hand, fps=fps, manifest=manifest)
-    for record in _records(outcomes, settings.cache_dir or default_cache_dir()):
+    for record in _records(outcomes, settings.cache_root):
         writer.add(record)
     _refuse_empty(rows, out)
     return MotionLibrary.load(writer.write(report=make_report(rows)))
@@ -170,11 +171,11 @@ def run_order(
 def _tell_start(jobs: list[Job], workers: int) -> None:
     if workers < 1:
         raise DemoError(f"--workers is {workers}; at least 1 is needed.")
-    root = jobs[0].settings.cache_dir or default_cache_dir()
+    root = jobs[0].settings.cache_root
     known = 0
     for job in jobs:
         with suppress(OSError):
-            known += cache_file(job.recording, job.settings, root).is_file()
+            known += cache_file(job.recording, job.settings).is_file()
     left = len(jobs) - known
     text = f"{known} of {len(jobs)} recordings are in the cache {root}"
     more = f", {left} to do; a new mesh can take a minute" if left else ""
@@ -187,18 +188,17 @@ def hash_inputs(order: Order) -> str:
     Args:
         order: recordings and settings.
     """
-    digest = hashlib.sha256(_settings_text(order.settings).encode())
-    for recording in order.recordings():
+    return _hash_inputs(order.recordings(), order.settings)
+
+
+def _hash_inputs(recordings: list[Recording], settings: MotionSettings) -> str:
+    text = json.dumps(settings.facts(), sort_keys=True)
+    digest = hashlib.sha256(text.encode())
+    for recording in recordings:
         digest.update(recording.name.encode())
         with suppress(OSError):  # a file that cannot be read has no content
             digest.update(content_hash(recording).encode())
     return digest.hexdigest()
-
-
-def _settings_text(settings: MotionSettings) -> str:
-    chosen = asdict(settings)
-    chosen.pop("cache_dir")
-    return json.dumps(chosen, sort_keys=True)
 
 
 def _without_doubles(
@@ -221,13 +221,14 @@ def _without_doubles(
     return list(kept.values()), rows
 
 
-def _facts(order: Order, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    settings = json.loads(_settings_text(order.settings))
+def _facts(
+    order: Order, recordings: list[Recording], rows: list[dict[str, Any]]
+) -> dict[str, Any]:
     return {
         "source": order.source,
         "seed": order.options.seed,
-        "settings": settings,
-        "inputs": hash_inputs(order),
+        "settings": order.settings.facts(),
+        "inputs": _hash_inputs(recordings, order.settings),
         "versions": {p: importlib.metadata.version(p) for p in PACKAGES},
         "quality": dict(Counter(row["status"] for row in rows)),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,12 @@ from flashdex.motions.hand_model import HandModel
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.meshes import hull_vertices
-from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
+from flashdex.motions.objects import (
+    ObjectAsset,
+    ObjectSettings,
+    default_cache_dir,
+    make_object,
+)
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.residuals import RetargetWeights, Targets
 from flashdex.motions.retarget import Retargeter
@@ -65,6 +70,17 @@ class MotionSettings:
     speed: float = 1.0
     strict: bool = False
     cache_dir: Path | None = None
+
+    @property
+    def cache_root(self) -> Path:
+        """Folder of the cache."""
+        return self.cache_dir or default_cache_dir()
+
+    def facts(self) -> dict[str, Any]:
+        """All that decides the result: everything but the place of the cache."""
+        chosen = asdict(self)
+        chosen.pop("cache_dir")
+        return chosen
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense."""

@@ -77,7 +77,7 @@ def draw_films(rollouts: list[Path]) -> str:
     _LOG.info("drawing %d films", len(todo))
     folder = Film.of(todo[0]).video.parent
     words = ["-m", "flashdex.viz.frames", *map(str, todo), str(folder)]
-    fault = _run(words, backend, timeout=60 + _SECONDS_A_FILM * len(todo))
+    fault = run_drawer(words, backend, timeout=60 + _SECONDS_A_FILM * len(todo))
     missing = [r.stem for r in todo if not Film.of(r).is_newer_than(r)]
     if not missing:
         return ""
@@ -90,12 +90,12 @@ def find_backend() -> str | None:
     asked = os.environ.get("MUJOCO_GL")
     usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("glfw",)
     for backend in (asked,) if asked else usual:
-        if not _run(["-c", _PROBE], backend, timeout=60):
+        if not run_drawer(["-c", _PROBE], backend, timeout=60):
             return backend
     return None
 
 
-def _run(words: list[str], backend: str, *, timeout: float) -> str:
+def run_drawer(words: list[str], backend: str, *, timeout: float) -> str:
     """Run Python with a graphics back end; return what went wrong, in one line."""
     package = Path(__file__).parents[2]
     paths = [str(package), os.environ.get("PYTHONPATH", "")]

@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.errors import LibraryError
+from flashdex.motions.checks_aligned import IK_P95, REFERENCE_DEPTH, TIP_DEPTH
 from flashdex.motions.library import MotionLibrary
 
 STATUSES = ("rejected", "flagged", "kept")
 # mm, from which on a figure flags a motion: W_IK, W_DEPTH, W_PEN
 LIMITS = {
-    "tip_error_p95_mm": 40.0,
-    "penetration_max_mm": 20.0,
-    "human_tip_depth_mm": 10.0,
+    "tip_error_p95_mm": 1e3 * IK_P95,
+    "penetration_max_mm": 1e3 * REFERENCE_DEPTH,
+    "human_tip_depth_mm": 1e3 * TIP_DEPTH[0],
 }
 # docs/data.md says the same at more length; a test compares the codes
 CODES = {

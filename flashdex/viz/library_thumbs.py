@@ -55,7 +55,7 @@ def draw_thumbnails(
         module = "flashdex.viz.library_thumbs"
         words = ["-m", module, str(library.path.resolve()), folder, *map(str, rows)]
         timeout = 60 + SECONDS_A_MOTION * len(rows)
-        fault = film._run(words, backend, timeout=timeout)
+        fault = film.run_drawer(words, backend, timeout=timeout)
         files = {row: Path(folder) / f"{row}.jpg" for row in rows}
         drawn = {row: f.read_bytes() for row, f in files.items() if f.is_file()}
     if len(drawn) == len(rows):

@@ -36,7 +36,10 @@ def backend():
 def draw(rollout, folder, backend):
     """One picture, made in a process of its own."""
     stored, target = rollout.save(folder / "one.npz"), folder / "one.npy"
-    assert film._run(["-c", DRAW, str(stored), str(target)], backend, timeout=120) == ""
+    assert (
+        film.run_drawer(["-c", DRAW, str(stored), str(target)], backend, timeout=120)
+        == ""
+    )
     return np.load(target).astype(int)
 
 

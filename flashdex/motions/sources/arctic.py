@@ -21,18 +21,19 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
+from flashdex.motions.checks import MAX_SECONDS
 from flashdex.motions.demo import DemoObject, HumanDemo
-from flashdex.motions.mano import load_mano, mano_file, rotations_from_axis_angle
+from flashdex.motions.gaps import missing_frames
+from flashdex.motions.mano import load_mano, rotations_from_axis_angle
+from flashdex.motions.mano_files import mano_pair
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.axis_angle import (
-    finite,
     part,
-    pose_track,
     same_length,
     track,
 )
 from flashdex.motions.sources.mesh_files import scaled_mesh
-from flashdex.motions.sources.rigid import to_array
+from flashdex.motions.sources.rigid import pose_track, to_array
 from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame
 from flashdex.motions.unpickle import load_object_array
@@ -43,8 +44,6 @@ SPLIT_LIST = "splits_json/protocol_p1.json"
 MILLIMETRE = 1e-3
 HINGE = np.array([0.0, 0.0, -1.0])  # through the origin of the object frame
 PARTS = ("top", "bottom")
-# A longer sequence holds several actions.
-MAX_SECONDS = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +91,7 @@ def list_arctic(options: SourceOptions) -> list[Recording]:
     assert mano is not None
     folders = (SEQUENCES,) if options.models else (SEQUENCES, TEMPLATES)
     require_folders(root, folders, dataset="ARCTIC")
-    models = tuple(mano_file(mano, side) for side in SIDES)
+    models = mano_pair(mano)
     splits = _read_splits(options.splits or root / SPLIT_LIST, given=options.splits)
     recordings = []
     for file in sorted((root / SEQUENCES).glob("*/*.mano.npy")):
@@ -184,7 +183,7 @@ def _read_objects(sequence: ArcticSequence) -> list[DemoObject]:
     """The top, turned about the hinge, and the bottom."""
     file = sequence.file("object")
     stored = track({"array": load_object_array(file)}, "array", 7, where=str(file))
-    seen = finite(stored)
+    seen = ~missing_frames(stored)
     turns = Rotation.from_rotvec(stored[seen, 1:4])
     place = stored[:, 4:] * MILLIMETRE
     opened = turns * Rotation.from_rotvec(stored[seen, :1] * HINGE)

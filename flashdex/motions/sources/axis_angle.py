@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flashdex.errors import DemoError
-from flashdex.motions.tracks import continuous, to_quat
 
 
 def track(data: Any, key: str, width: int, *, where: str) -> np.ndarray:
@@ -24,12 +22,9 @@ def track(data: Any, key: str, width: int, *, where: str) -> np.ndarray:
     Raises:
         DemoError: the key is missing or its shape is another one.
     """
-    if not isinstance(data, Mapping) or key not in data:
-        kind = type(data).__name__
-        found = ", ".join(map(str, data)) if isinstance(data, Mapping) else f"a {kind}"
-        raise DemoError(f"{where}: lacks {key} (E_KEYS). Found: {found}.")
+    stored = part(data, key, where=where)
     try:
-        values = np.asarray(data[key], dtype=np.float64)
+        values = np.asarray(stored, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DemoError(f"{where}: {key} holds no numbers (E_KEYS).") from error
     if values.ndim != 2 or values.shape[1] != width or not len(values):
@@ -46,29 +41,10 @@ def part(data: Any, key: str, *, where: str) -> Any:
         DemoError: the key is missing.
     """
     if not isinstance(data, Mapping) or key not in data:
-        found = ", ".join(map(str, data)) if isinstance(data, Mapping) else type(data)
+        kind = type(data).__name__
+        found = ", ".join(map(str, data)) if isinstance(data, Mapping) else f"a {kind}"
         raise DemoError(f"{where}: lacks {key} (E_KEYS). Found: {found}.")
     return data[key]
-
-
-def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Position and quaternion wxyz without sign flips, NaN in unseen frames, (T, 7).
-
-    Args:
-        turns: rotations of the seen frames.
-        positions: m, (T, 3).
-        seen: frames that were tracked, (T,).
-    """
-    pose = np.full((len(positions), 7), np.nan)
-    if seen.any():
-        pose[seen, :3] = positions[seen]
-        pose[seen, 3:] = continuous(to_quat(turns))
-    return pose
-
-
-def finite(*tracks: np.ndarray) -> np.ndarray:
-    """Frames in which all tracks (T, ...) hold numbers, (T,)."""
-    return np.all([np.isfinite(t.reshape(len(t), -1)).all(-1) for t in tracks], axis=0)
 
 
 def same_length(lengths: Mapping[str, int], *, where: str) -> int:

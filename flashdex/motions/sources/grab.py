@@ -21,17 +21,18 @@ from scipy.spatial.transform import Rotation
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
-from flashdex.motions.mano import load_mano, mano_file, rotations_from_axis_angle
+from flashdex.motions.gaps import missing_frames
+from flashdex.motions.mano import load_mano, rotations_from_axis_angle
+from flashdex.motions.mano_files import mano_pair
 from flashdex.motions.meshes import load_mesh
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.axis_angle import (
-    finite,
     part,
-    pose_track,
     same_length,
     track,
 )
 from flashdex.motions.sources.entries import number, word
+from flashdex.motions.sources.rigid import pose_track
 from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame, rotation
 from flashdex.motions.unpickle import load_npz
@@ -107,7 +108,7 @@ def list_grab(options: SourceOptions) -> list[Recording]:
     assert root is not None  # ``Source.needs``
     assert mano is not None
     require_folders(root, (SEQUENCES, TOOLS), dataset="GRAB")
-    models = tuple(mano_file(mano, side) for side in SIDES)
+    models = mano_pair(mano)
     files = sorted((root / SEQUENCES).glob("s*/*.npz"))
     if not files:
         raise DemoError(
@@ -224,7 +225,7 @@ def _read_body(
             f"{where}: mesh {mesh} not found (E_FILE). Unpack tools.zip, or name the "
             f"folder of contact_meshes with --models."
         )
-    seen = finite(turn, place)
+    seen = ~missing_frames(turn, place)
     # v R + t turns by the transpose of R
     return pose_track(Rotation.from_rotvec(turn[seen]).inv(), place, seen), mesh
 
@@ -238,7 +239,7 @@ def _support(sequence: GrabSequence, data: dict[str, Any]) -> tuple[float | None
         vertices = np.asarray(load_mesh(mesh).vertices)
     except (DemoError, MeshError) as error:
         return None, f"the table cannot be read, so it is estimated: {error}"
-    seen = np.flatnonzero(finite(pose))
+    seen = np.flatnonzero(~missing_frames(pose))
     if not len(seen):
         return None, "the table was not tracked: estimated from objects at rest"
     first = pose[seen[0]]

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import DemoError
-from flashdex.keys import SIDES
 from flashdex.motions.demo import HumanDemo
-from flashdex.motions.mano import mano_file
+from flashdex.motions.mano_files import mano_pair
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.hot3d_files import Mask, read_mask, read_poses
 from flashdex.motions.sources.hot3d_hands import read_keypoints
@@ -72,7 +71,7 @@ def list_hot3d(options: SourceOptions) -> list[Recording]:
     refuse_clone([folders[0] / OBJECTS_FILE])
     library = find_library(root, options.models)
     mano = options.mano
-    models = () if mano is None else tuple(mano_file(mano, side) for side in SIDES)
+    models = () if mano is None else mano_pair(mano)
     return [
         Recording(
             name=folder.name,

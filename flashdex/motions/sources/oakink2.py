@@ -12,8 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from flashdex.errors import DemoError
-from flashdex.keys import SIDES
-from flashdex.motions.mano import mano_file
+from flashdex.motions.mano_files import mano_pair
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.oakink2_files import ANNOTATIONS, OakInk2Sequence
 from flashdex.motions.sources.oakink2_program import read_program
@@ -36,7 +35,7 @@ def list_oakink2(options: SourceOptions) -> list[Recording]:
     assert mano is not None
     require_folders(root, (ANNOTATIONS,), dataset="OakInk2")
     folders = _find_mesh_folders(root, options.models)
-    models = tuple(mano_file(mano, side) for side in SIDES)
+    models = mano_pair(mano)
     sequences = [
         OakInk2Sequence(root=root, token=file.stem, mesh_folders=folders, mano=mano)
         for file in sorted((root / ANNOTATIONS).glob("*.pkl"))

@@ -18,7 +18,7 @@ from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.mano import load_mano, rotations_from_quats
-from flashdex.motions.meshes import load_mesh
+from flashdex.motions.meshes import hull_vertices, load_mesh
 from flashdex.motions.sources.oakink2_annotation import Annotation, read_annotation
 from flashdex.motions.sources.oakink2_files import OakInk2Sequence
 from flashdex.motions.sources.oakink2_program import Primitive, read_program
@@ -164,7 +164,7 @@ def _support(bodies: list[DemoObject]) -> tuple[float, list[str]]:
         pose = pose[np.isfinite(pose).all(axis=1)]
         if len(pose) >= 2:
             poses.append(transform_pose(pose, Y_UP))
-            vertices.append(np.asarray(body.load_mesh().convex_hull.vertices))
+            vertices.append(hull_vertices(body.load_mesh()))
     height, found = 0.0, False
     if poses:
         height, found = estimate_support(poses, vertices, FPS / SUPPORT_STRIDE)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flashdex.errors import DemoError
+from flashdex.motions.gaps import missing_frames
 from flashdex.motions.tracks import continuous, to_quat
 
 ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
@@ -62,20 +63,33 @@ def poses_from_matrices(
         raise DemoError(
             f"{what}: E_KEYS: shape {matrices.shape}; expected (T, 4, 4) transforms."
         )
-    pose = np.full((len(matrices), 7), np.nan)
-    seen = np.isfinite(matrices).all(axis=(1, 2))
+    seen = ~missing_frames(matrices)
     if not seen.any():
-        return pose, []
+        return np.full((len(matrices), 7), np.nan), []
     rigid = matrices[seen].astype(np.float64)
     frames, turns = np.flatnonzero(seen), rigid[:, :3, :3]
     _refuse(np.abs(rigid[:, 3] - LAST_ROW).max(-1) > 1e-3, frames, what, "last row")
     _refuse(np.linalg.det(turns) < 1e-3, frames, what, "determinant")
     errors = np.swapaxes(turns, 1, 2) @ turns - np.eye(3)
     skew = np.linalg.norm(errors, axis=(1, 2)) > ROTATION_TOLERANCE
-    pose[seen, :3] = rigid[:, :3, 3]
-    pose[seen, 3:] = continuous(to_quat(Rotation.from_matrix(turns)))
+    pose = pose_track(Rotation.from_matrix(turns), matrices[:, :3, 3], seen)
     text = f"E_ROT: {what}: {skew.sum()} rotations made orthonormal, first in frame "
     return pose, [f"{text}{frames[skew][0]}"] if skew.any() else []
+
+
+def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Position and quaternion wxyz without sign flips, NaN in unseen frames, (T, 7).
+
+    Args:
+        turns: rotations of the seen frames.
+        positions: m, (T, 3).
+        seen: frames that were tracked, (T,).
+    """
+    pose = np.full((len(positions), 7), np.nan)
+    if seen.any():
+        pose[seen, :3] = positions[seen]
+        pose[seen, 3:] = continuous(to_quat(turns))
+    return pose
 
 
 def _refuse(bad: np.ndarray, frames: np.ndarray, what: str, fault: str) -> None:

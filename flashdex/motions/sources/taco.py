@@ -17,8 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from flashdex.errors import DemoError
-from flashdex.keys import SIDES
-from flashdex.motions.mano import mano_file
+from flashdex.motions.mano_files import mano_pair
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.roots import refuse_clone, require_folders
 from flashdex.motions.sources.taco_sequence import (
@@ -54,7 +53,7 @@ def list_taco(options: SourceOptions) -> list[Recording]:
     assert mano is not None
     require_folders(root, (HANDS, OBJECTS), dataset="TACO")
     meshes = _find_meshes(root, options.models)
-    models = tuple(mano_file(mano, side) for side in SIDES)
+    models = mano_pair(mano)
     folders = sorted({*_folders(root / HANDS), *_folders(root / OBJECTS)})
     splits = _read_splits(options.splits, folders) if options.splits else {}
     recordings = []

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
-from flashdex.errors import DemoError, MeshError
+from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.mano import load_mano, rotations_from_axis_angle
-from flashdex.motions.meshes import load_mesh
+from flashdex.motions.sources.mesh_files import scaled_mesh
 from flashdex.motions.sources.rigid import poses_from_matrices
 from flashdex.motions.sources.roots import refuse_pointer, relative
 from flashdex.motions.sources.taco_hands import (
@@ -162,7 +161,8 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
     pose, found = poses_from_matrices(_load_matrices(file), what=str(file))
     notes += found
     category = sequence.words[1 + ROLES.index(role)].replace(" ", "_")
-    return DemoObject(f"{category}_{key}", _load_mesh(sequence.meshes[key]), pose)
+    mesh = scaled_mesh(sequence.meshes[key], MESH_SCALE)
+    return DemoObject(f"{category}_{key}", mesh, pose)
 
 
 def _load_matrices(file: Path) -> np.ndarray:
@@ -176,14 +176,6 @@ def _load_matrices(file: Path) -> np.ndarray:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise DemoError(f"{file}: E_KEYS: expected one array of (T, 4, 4) floats.")
     return array
-
-
-def _load_mesh(file: Path) -> trimesh.Trimesh:
-    try:
-        mesh = load_mesh(file)
-    except MeshError as error:
-        raise DemoError(str(error)) from error
-    return mesh.apply_scale(MESH_SCALE)
 
 
 def _common_length(

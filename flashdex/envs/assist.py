@@ -1,116 +1,15 @@
-"""Virtual-object assist: a fading PD wrench on the objects (method section 11)."""
+"""When the virtual-object assist fades (method section 11)."""
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from flashdex.geometry.rotation import (
-    quat_conj,
-    quat_mul,
-    quat_rotate,
-    quat_rotate_inverse,
-    quat_to_rotvec,
-)
-
 if TYPE_CHECKING:
     from flashdex.recipe import AssistConfig
-
-GRAVITY = 9.81  # m/s2
-
-
-def assist_wrench(
-    pose: Tensor,
-    vel: Tensor,
-    ref_pose: Tensor,
-    ref_vel: Tensor,
-    inertia: Tensor,
-    kp: Tensor,
-    kv: Tensor,
-    *,
-    torque_ratio: float,
-    force_limit: float,
-    torque_limit: float,
-) -> Tensor:
-    """PD wrench that pulls each object to its reference.
-
-    ``F = kp (x_ref - x) + kv (v_ref - v)`` and
-    ``tau = I_w [ratio kp rotvec(R_ref R^T) + sqrt(ratio) kv (w_ref - w)]``,
-    each component clamped.
-
-    Args:
-        pose: object position and quaternion, world, (N, O, 7).
-        vel: linear and angular velocity, world, (N, O, 6).
-        ref_pose: reference, (N, O, 7).
-        ref_vel: reference, (N, O, 6).
-        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
-        kp: stiffness of each world, N/m, (N,).
-        kv: damping of each world, N s/m, (N,).
-        torque_ratio: angular over linear stiffness.
-        force_limit: N.
-        torque_limit: N m.
-
-    Returns:
-        Force and torque in world axes, (N, O, 6).
-    """
-    kp, kv = kp[:, None, None], kv[:, None, None]
-    force = kp * (ref_pose[..., :3] - pose[..., :3])
-    force = force + kv * (ref_vel[..., :3] - vel[..., :3])
-    quat = pose[..., 3:]
-    turn = quat_to_rotvec(quat_mul(ref_pose[..., 3:], quat_conj(quat)))
-    accel = torque_ratio * kp * turn
-    accel = accel + math.sqrt(torque_ratio) * kv * (ref_vel[..., 3:] - vel[..., 3:])
-    local = quat_rotate_inverse(quat, accel)
-    torque = quat_rotate(quat, (inertia @ local.unsqueeze(-1)).squeeze(-1))
-    force = force.clamp(-force_limit, force_limit)
-    return torch.cat([force, torque.clamp(-torque_limit, torque_limit)], -1)
-
-
-def hold_wrench(
-    pose: Tensor,
-    vel: Tensor,
-    ref_pose: Tensor,
-    ref_vel: Tensor,
-    mass: Tensor,
-    inertia: Tensor,
-    share: Tensor,
-    *,
-    stiffness: float,
-) -> Tensor:
-    """Carry each object along its reference while a grip forms after a reset.
-
-    A reference pose in mid grasp has no grip force yet: without help the object falls
-    some centimetres before the fingers have closed. Critically damped, mass-normalised,
-    gravity included: ``F = share m (w^2 (x_ref - x) + 2 w (v_ref - v) + g)``, torques
-    alike with the inertia.
-
-    Args:
-        pose: object position and quaternion, world, (N, O, 7).
-        vel: linear and angular velocity, world, (N, O, 6).
-        ref_pose: reference, (N, O, 7).
-        ref_vel: reference, (N, O, 6).
-        mass: kg, (N, O).
-        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
-        share: 1 right after the reset, falling to 0, (N,).
-        stiffness: w, rad/s.
-
-    Returns:
-        Force and torque in world axes, (N, O, 6).
-    """
-    quat = pose[..., 3:]
-    turn = quat_to_rotvec(quat_mul(ref_pose[..., 3:], quat_conj(quat)))
-    offset = torch.cat([ref_pose[..., :3] - pose[..., :3], turn], -1)
-    accel = stiffness**2 * offset + 2 * stiffness * (ref_vel - vel)
-    force = accel[..., :3]
-    force[..., 2] += GRAVITY
-    local = quat_rotate_inverse(quat, accel[..., 3:]).unsqueeze(-1)
-    torque = quat_rotate(quat, (inertia @ local).squeeze(-1))
-    wrench = torch.cat([mass.unsqueeze(-1) * force, torque], -1)
-    return share[:, None, None] * wrench
 
 
 class AssistSchedule:
@@ -209,7 +108,8 @@ class AssistSchedule:
 
     def draw(self, num_envs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw each world's gains uniformly between lower and upper, (N,) each."""
-        share = torch.rand(num_envs, generator=generator)
+        device = generator.device
+        share = torch.rand(num_envs, generator=generator, device=device)
         kp = self.lower[0] + share * (self.upper[0] - self.lower[0])
         kv = self.lower[1] + share * (self.upper[1] - self.lower[1])
         return kp, kv

@@ -74,18 +74,19 @@ class Judge:
             self.terminations = {k: self.terminations[k] for k in keep}
         self.weights = {name: o.weight for name, o in self.rewards.items()}
         ranges = [torch.as_tensor(hands[s].joint_range) for s in keys.SIDES]
-        ranges = torch.stack(ranges).float()
+        device = bank.table.device
+        ranges = torch.stack(ranges).float().to(device)
         self.joint_span = ranges[..., 1] - ranges[..., 0]
         radii = [torch.as_tensor(hands[s].tip_radius) for s in keys.SIDES]
-        self.tip_radius = torch.stack(radii).float()
+        self.tip_radius = torch.stack(radii).float().to(device)
         if "object_points" in self.rewards:
             rho = self.rewards["object_points"].rho
             self.points = rewards.rescale_points(bank.points, bank.radius, rho=rho)
-        self.object_sum = torch.zeros(num_envs, 2)
+        self.object_sum = torch.zeros(num_envs, 2, device=device)
 
-    def reset(self, env_ids: Tensor) -> None:
-        """Forget the running sums of worlds that start anew."""
-        self.object_sum[env_ids] = 0.0
+    def reset(self, mask: Tensor) -> None:
+        """Forget the running sums of worlds that start anew, (N,) bool."""
+        self.object_sum = torch.where(mask.unsqueeze(-1), 0.0, self.object_sum)
 
     def __call__(
         self,
@@ -118,7 +119,7 @@ class Judge:
                 terms[name] = terms[name] * present
         task = terms.get("object_points", terms.get("object_pose"))
         if task is not None:
-            self.object_sum += torch.nan_to_num(task)
+            self.object_sum = self.object_sum + torch.nan_to_num(task)
         causes = self._causes(state, kin, ref, own, active, present, steps)
         blame = torch.zeros_like(active)
         for cause in causes.values():

@@ -58,8 +58,9 @@ def draw_reset(
     n, joints = len(motion), joint_range.shape[1]
     frame = start_frames(length, generator)
     frame = torch.where(from_start, torch.zeros_like(frame), frame)
-    draw = torch.randn(n, 2, joints, generator=generator)
-    vel = torch.randn(n, 2, joints, generator=generator)
+    shape, device = (n, 2, joints), motion.device
+    draw = torch.randn(shape, generator=generator, device=device)
+    vel = torch.randn(shape, generator=generator, device=device)
     span = joint_range[..., 1] - joint_range[..., 0]
     std = noise.finger_range * span
     std[:, :3] = noise.wrist_pos

@@ -11,14 +11,21 @@ class UniformSampler:
 
     Args:
         num_motions: motions in the collection.
+        device: where rows are drawn.
     """
 
-    def __init__(self, num_motions: int) -> None:
-        self.weights = torch.ones(num_motions)
+    def __init__(self, num_motions: int, *, device: torch.device | str = "cpu") -> None:
+        self.weights = torch.ones(num_motions, device=device)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Return motion rows, (count,) int64."""
-        return torch.multinomial(self.weights, count, True, generator=generator)
+        # Not torch.multinomial: some of its checks wait for the device.
+        edges = self.weights.double().cumsum(0)
+        draw = torch.rand(
+            count, generator=generator, device=edges.device, dtype=edges.dtype
+        )
+        row = torch.searchsorted(edges, draw * edges[-1], right=True)
+        return row.clamp_max(len(edges) - 1)
 
     def mark_converted(self, motion: int) -> None:
         """Conversions change nothing here."""
@@ -30,10 +37,17 @@ class UnconvertedSampler(UniformSampler):
     Args:
         num_motions: motions in the collection.
         converted_weight: weight of a converted motion against 1.
+        device: where rows are drawn.
     """
 
-    def __init__(self, num_motions: int, *, converted_weight: float = 0.25) -> None:
-        super().__init__(num_motions)
+    def __init__(
+        self,
+        num_motions: int,
+        *,
+        converted_weight: float = 0.25,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(num_motions, device=device)
         self.converted_weight = converted_weight
 
     def mark_converted(self, motion: int) -> None:
@@ -54,5 +68,5 @@ def start_frames(length: Tensor, generator: torch.Generator) -> Tensor:
         length: frames of the drawn motions, (n,).
         generator: source of randomness.
     """
-    draw = torch.rand(length.shape, generator=generator)
+    draw = torch.rand(length.shape, generator=generator, device=length.device)
     return (draw * 0.99 * length).long()

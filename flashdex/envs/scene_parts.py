@@ -110,14 +110,53 @@ def add_object(
         if i >= len(parts):
             _add_grain(body, name, inside, OBJECT_BITS)
             continue
-        mesh = spec.add_mesh(name=name)
-        mesh.uservert = np.asarray(parts[i], np.float64).reshape(-1)
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-        geom.contype, geom.conaffinity = OBJECT_BITS
-        geom.friction = [physics.object_friction, 0.05, 0.05]
-        geom.condim = physics.condim
-        geom.rgba = [0.85, 0.55, 0.25, 1.0] if slot == 0 else [0.3, 0.6, 0.4, 1.0]
+        add_part_mesh(spec, name, np.asarray(parts[i]))
+        _add_part(body, name, name, slot, physics)
+
+
+def add_part_mesh(spec: mujoco.MjSpec, name: str, vertices: np.ndarray) -> None:
+    """Add one convex part as a mesh asset.
+
+    Args:
+        spec: scene under construction.
+        name: of the asset.
+        vertices: object axes, m, (V, 3).
+    """
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = np.asarray(vertices, np.float64).reshape(-1)
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+
+
+def _add_part(
+    body: mujoco.MjsBody, name: str, mesh: str, slot: int, physics: PhysicsConfig
+) -> None:
+    geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh)
+    geom.contype, geom.conaffinity = OBJECT_BITS
+    geom.friction = [physics.object_friction, 0.05, 0.05]
+    geom.condim = physics.condim
+    geom.rgba = [0.85, 0.55, 0.25, 1.0] if slot == 0 else [0.3, 0.6, 0.4, 1.0]
+
+
+def add_object_of_meshes(
+    spec: mujoco.MjSpec, meshes: list[str], slot: int, physics: PhysicsConfig
+) -> None:
+    """Add the free body of one object slot whose parts are given mesh assets.
+
+    Its mass is a placeholder: engines that swap objects write the numbers of the
+    object a world holds.
+
+    Args:
+        spec: scene that holds the assets.
+        meshes: names of the assets, one a part.
+        slot: object slot; the body is called ``object<slot>``.
+        physics: friction and contact dimension.
+    """
+    body = spec.worldbody.add_body(name=f"object{slot}")
+    body.add_freejoint(name=f"object{slot}")
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos = 0.01, [1e-5] * 3, [_OFFSET] * 3
+    for i, mesh in enumerate(meshes):
+        _add_part(body, f"object{slot}_part{i}", mesh, slot, physics)
 
 
 def _set_inertia(body: mujoco.MjsBody, library: MotionLibrary, row: int) -> None:
@@ -174,18 +213,21 @@ def add_supports(spec: mujoco.MjSpec, discs: Tensor, physics: PhysicsConfig) -> 
         geom.friction = [physics.support_friction, 0.05, 0.05]
 
 
-def add_contact_sensors(spec: mujoco.MjSpec, hand: HandSpec, slot: int) -> None:
+def add_contact_sensors(
+    spec: mujoco.MjSpec, hand: HandSpec, slot: int, suffix: str = ""
+) -> None:
     """Add a sensor a link: net force and point of its contact with one object.
 
     Args:
         spec: scene that holds the hand and the object.
         hand: the hand whose links are sensed.
-        slot: slot of the hand's own object.
+        slot: slot of the object.
+        suffix: ends the sensors' names, where there are several sets.
     """
     for link in hand.link_names:
         # Ordered object first: the sensor then reports the force ON the link.
         spec.add_sensor(
-            name=f"contact_{link}",
+            name=f"contact_{link}{suffix}",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
             objname=f"object{slot}",

@@ -13,18 +13,19 @@ from torchrl.envs import EnvBase
 
 from flashdex import keys
 from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
-from flashdex.envs.assist import AssistSchedule, assist_wrench, hold_wrench
+from flashdex.envs.assist import AssistSchedule
 from flashdex.envs.contact import CODE_WIDTH, contact_code
 from flashdex.envs.judge import Judge, Outcome
-from flashdex.envs.physics.base import Physics, WrenchFn
+from flashdex.envs.physics.base import Physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.reset import ResetDraw, draw_reset, reset_state
 from flashdex.envs.samplers import SAMPLERS, UnconvertedSampler
 from flashdex.envs.specs import action_spec, done_spec, reward_spec, state_spec
 from flashdex.envs.threads import few_threads
+from flashdex.envs.wrench import ObjectWrench, hold_share
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.recipe import EnvConfig
+from flashdex.recipe import AssistConfig, EnvConfig
 
 
 @dataclass
@@ -74,17 +75,17 @@ class TrackingEnv(EnvBase):
         seed: int = 0,
         evaluation: bool = False,
     ) -> None:
-        n = physics.num_envs
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([n]))
+        n, device = physics.num_envs, physics.device
+        super().__init__(device=device, batch_size=torch.Size([n]))
         self.physics, self.bank, self.hands, self.config = physics, bank, hands, config
         self.step_dt = step_dt
         self.group_map, self.num_envs = {side: [side] for side in keys.SIDES}, n
         self.num_attempts = n if evaluation else round(config.attempt_share * n)
-        self.attempt = torch.arange(n) < self.num_attempts
-        self.kinematics = HandKinematics(hands)
+        self.attempt = torch.arange(n, device=device) < self.num_attempts
+        self.kinematics = HandKinematics(hands).to(device)
         ranges = [torch.as_tensor(hands[s].joint_range) for s in keys.SIDES]
-        self.joint_range = torch.stack(ranges).float()
-        self.lead_s = torch.zeros(()) if lead_s is None else lead_s
+        self.joint_range = torch.stack(ranges).float().to(device)
+        self.lead_s = (torch.zeros(()) if lead_s is None else lead_s).to(device)
         self.judge = Judge(
             bank,
             hands,
@@ -94,29 +95,35 @@ class TrackingEnv(EnvBase):
             lead_s=self.lead_s,
             evaluation=evaluation,
         )
-        self.sampler = SAMPLERS[config.sampler](bank.num_motions)
-        self.attempt_sampler = UnconvertedSampler(bank.num_motions)
+        self.sampler = SAMPLERS[config.sampler](bank.num_motions, device=device)
+        self.attempt_sampler = UnconvertedSampler(bank.num_motions, device=device)
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
         scale = [config.wrist_pos_scale] * 3 + [config.wrist_rot_scale] * 3
-        self._wrist_scale = torch.tensor(scale)
+        self._wrist_scale = torch.tensor(scale, device=device)
         self.assist: AssistSchedule | None = None
         if config.assist is not None and config.assist.enabled and not evaluation:
             self.assist = AssistSchedule(config.assist)
         self._max_steps = round(config.max_seconds / step_dt)
-        self.motion = torch.zeros(n, dtype=torch.long)
-        self.frame = torch.ones(n, dtype=torch.long)
-        self.steps = torch.zeros(n, dtype=torch.long)
+        whole = {"dtype": torch.long, "device": device}
+        self.motion = torch.zeros(n, **whole)
+        self.frame = torch.ones(n, **whole)
+        self.steps = torch.zeros(n, **whole)
         self.forced_motion: Tensor | None = None
         self.target_override: Callable[[TrackingEnv], Tensor] | None = None
-        self._filter = torch.zeros(n, 2, 6)
-        self._target = torch.zeros(n, 2, self.joint_range.shape[1])
+        self._filter = torch.zeros(n, 2, 6, device=device)
+        self._target = torch.zeros(n, 2, self.joint_range.shape[1], device=device)
         shape = (n, 2, hands["left"].num_links, CODE_WIDTH)
-        self._contact = torch.zeros(shape, dtype=torch.int8)
+        self._contact = torch.zeros(shape, dtype=torch.int8, device=device)
         self.info: StepInfo | None = None
         self._make_specs()
-        self.generator = torch.Generator()
+        self.generator = torch.Generator(device)
         self.set_seed(seed)
         self.redraw_assist()
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps of the longest episode."""
+        return min(int(self.bank.length.max()) - 1, self._max_steps)
 
     def _make_specs(self) -> None:
         n, joints = self.num_envs, self.joint_range.shape[1]
@@ -132,54 +139,68 @@ class TrackingEnv(EnvBase):
     def redraw_assist(self) -> None:
         """Draw each world's assist gains from the present level."""
         n = self.num_envs
-        self.assist_kp, self.assist_kv = torch.zeros(n), torch.zeros(n)
+        self.assist_kp = self.assist_kv = torch.zeros(n, device=self.device)
         if self.assist is not None and self.assist.active:
             kp, kv = self.assist.draw(n, self.generator)
-            self.assist_kp = torch.where(self.attempt, torch.zeros(n), kp)
-            self.assist_kv = torch.where(self.attempt, torch.zeros(n), kv)
+            self.assist_kp = torch.where(self.attempt, 0.0, kp)
+            self.assist_kv = torch.where(self.attempt, 0.0, kv)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:
-        mask = torch.ones(self.num_envs, dtype=torch.bool)
+        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is not None:
             mask = asked.reshape(self.num_envs)
-        ids = mask.nonzero().squeeze(-1)
+        return self.restart(mask)
+
+    def restart(self, mask: Tensor) -> TensorDict:
+        """Begin new episodes in some worlds; what the coming step starts from.
+
+        The same as ``reset`` of the worlds marked in ``_reset``, without the checks
+        of TorchRL, which wait for the device.
+
+        Args:
+            mask: worlds to reset, (N,) bool.
+
+        Returns:
+            State and flags of all worlds, batch (N,).
+        """
         with few_threads(self.num_envs):
-            out = self._reset_worlds(ids)
+            out = self._restart(mask)
         for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+            out[key] = torch.zeros_like(mask).unsqueeze(-1)
         return out
 
-    def _reset_worlds(self, ids: Tensor) -> TensorDict:
-        if len(ids):
-            draw = self._draw(ids)
-            state = reset_state(draw, self.bank, self.joint_range)
-            self.physics.reset(ids, draw.motion, **state)
-            self.motion[ids] = draw.motion
-            # The state of frame s is written; the next step is scored on s + 1.
-            self.frame[ids] = draw.frame + 1
-            self.steps[ids] = 0
-            self._filter[ids] = 0.0
-            self._target[ids] = state["joint_pos"]
-            self.judge.reset(ids)
+    def _restart(self, mask: Tensor) -> TensorDict:
+        draw = self._draw()
+        start = reset_state(draw, self.bank, self.joint_range)
+        self.physics.reset(mask, draw.motion, **start)
+        self.motion = torch.where(mask, draw.motion, self.motion)
+        # The state of frame s is written; the next step is scored on s + 1.
+        self.frame = torch.where(mask, draw.frame + 1, self.frame)
+        self.steps = torch.where(mask, 0, self.steps)
+        rows = mask[:, None, None]
+        self._filter = torch.where(rows, 0.0, self._filter)
+        self._target = torch.where(rows, start["joint_pos"], self._target)
+        self.judge.reset(mask)
         state = self.physics.state()
-        kin = self.kinematics(state[keys.JOINT_POS][ids], None)
-        self._contact[ids] = contact_code(state[keys.CONTACT][ids], kin)
+        kin = self.kinematics(state[keys.JOINT_POS], None)
+        code = contact_code(state[keys.CONTACT], kin)
+        self._contact = torch.where(rows.unsqueeze(-1), code, self._contact)
         return self._observation(state)
 
-    def _draw(self, ids: Tensor) -> ResetDraw:
-        attempt = self.attempt[ids]
-        motion = self.sampler.sample(len(ids), self.generator)
-        tried = self.attempt_sampler.sample(len(ids), self.generator)
-        motion = torch.where(attempt, tried, motion)
-        if self.forced_motion is not None:
-            motion = self.forced_motion[ids]
+    def _draw(self) -> ResetDraw:
+        motion = self.forced_motion
+        if motion is None:
+            free = self.sampler.sample(self.num_envs, self.generator)
+            tried = self.attempt_sampler.sample(self.num_envs, self.generator)
+            motion = torch.where(self.attempt, tried, free)
+        every = torch.ones_like(self.attempt)
         return draw_reset(
             motion,
-            attempt if self.config.rsi else torch.ones_like(attempt),
-            attempt,
+            self.attempt if self.config.rsi else every,
+            self.attempt,
             self.bank.length[motion],
             self.config.reset_noise,
             self.joint_range,
@@ -196,13 +217,13 @@ class TrackingEnv(EnvBase):
         ref = self.bank.at(self.motion, self.frame)
         self._act(action, ref)
         state = self.physics.state()
-        self.steps += 1
+        self.steps = self.steps + 1
         kin = self.kinematics(state[keys.JOINT_POS], state[keys.JOINT_VEL])
         outcome = self.judge(
             state, kin, ref, action, self._target, self.motion, self.steps
         )
-        scored = self.frame.clone()
-        self.info = StepInfo(outcome, scored, self.motion.clone())
+        scored = self.frame
+        self.info = StepInfo(outcome, scored, self.motion)
         terminated = outcome.blame.any(-1, keepdim=True)
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
@@ -236,65 +257,42 @@ class TrackingEnv(EnvBase):
         """Reference joints ahead by the lag of the wrist servos, (N, 2, J)."""
         return ref["joint_pos"] + self.lead_s * ref["joint_vel"]
 
-    def _wrench(self, ref: TensorDictBase) -> WrenchFn | None:
+    def _wrench(self, ref: TensorDictBase) -> ObjectWrench | None:
         """What acts on the objects besides contact and gravity; None is nothing."""
         assist = self.assist if self.assist is not None and self.assist.active else None
-        hold = self._hold_share()
-        if assist is None and not hold.any():
-            return None
-        ref_pose = torch.cat([ref["object_pos"], ref["object_quat"]], -1)
-        ref_vel = torch.cat([ref["object_linvel"], ref["object_angvel"]], -1)
-        rows = self.bank.object_index[self.motion]
-        mass = self.bank.mass[rows.clamp_min(0)]
-        inertia = self.bank.inertia[rows.clamp_min(0)]
-        present = (rows >= 0).unsqueeze(-1)
-
-        def wrench(pose: Tensor, vel: Tensor) -> Tensor:
-            total = hold_wrench(
-                pose,
-                vel,
-                ref_pose,
-                ref_vel,
-                mass,
-                inertia,
-                hold,
-                stiffness=self.config.reset_hold_stiffness,
-            )
-            if assist is not None:
-                total = total + assist_wrench(
-                    pose,
-                    vel,
-                    ref_pose,
-                    ref_vel,
-                    inertia,
-                    self.assist_kp,
-                    self.assist_kv,
-                    torque_ratio=assist.config.torque_ratio,
-                    force_limit=assist.config.force_limit,
-                    torque_limit=assist.config.torque_limit,
-                )
-            return torch.where(present, total, torch.zeros_like(total))
-
-        return wrench
-
-    def _hold_share(self) -> Tensor:
-        """Share of the grip hold left in each world, 1 after a reset, then 0, (N,)."""
         steps = self.config.reset_hold_s / self.step_dt
-        if steps <= 0:
-            return torch.zeros(self.num_envs)
-        share = (1.0 - self.steps / steps).clamp_min(0.0)
-        return torch.where(self.attempt, torch.zeros_like(share), share)
+        hold = hold_share(self.steps, ~self.attempt, steps)
+        # A look at the numbers is free on the cpu; a device is not waited for.
+        holds = steps > 0 and (self.device.type != "cpu" or bool(hold.any()))
+        if assist is None and not holds:
+            return None
+        rows = self.bank.object_index[self.motion]
+        limits = self.config.assist or AssistConfig()
+        return ObjectWrench(
+            ref_pose=torch.cat([ref["object_pos"], ref["object_quat"]], -1),
+            ref_vel=torch.cat([ref["object_linvel"], ref["object_angvel"]], -1),
+            mass=self.bank.mass[rows.clamp_min(0)],
+            inertia=self.bank.inertia[rows.clamp_min(0)],
+            present=rows >= 0,
+            hold=hold,
+            kp=self.assist_kp,
+            kv=self.assist_kv,
+            hold_stiffness=self.config.reset_hold_stiffness,
+            torque_ratio=limits.torque_ratio,
+            force_limit=limits.force_limit,
+            torque_limit=limits.torque_limit,
+        )
 
     def _observation(self, state: TensorDictBase) -> TensorDict:
         out = {
             keys.JOINT_POS: state[keys.JOINT_POS],
             keys.JOINT_VEL: state[keys.JOINT_VEL],
-            keys.JOINT_TARGET: self._target.clone(),
+            keys.JOINT_TARGET: self._target,
             keys.OBJECT_POSE: state[keys.OBJECT_POSE],
             keys.OBJECT_VEL: state[keys.OBJECT_VEL],
-            keys.CONTACT: self._contact.clone(),
-            keys.MOTION: self.motion.clone().unsqueeze(-1),
-            keys.FRAME: self.frame.clone().unsqueeze(-1),
-            keys.ATTEMPT: self.attempt.clone().unsqueeze(-1),
+            keys.CONTACT: self._contact,
+            keys.MOTION: self.motion.unsqueeze(-1),
+            keys.FRAME: self.frame.unsqueeze(-1),
+            keys.ATTEMPT: self.attempt.unsqueeze(-1),
         }
         return TensorDict(out, batch_size=self.batch_size)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import platform
-from dataclasses import dataclass, field
+from collections import deque
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -16,10 +17,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.cpu import CpuPhysics
+from flashdex.envs.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.rollout import Rollout
+from flashdex.training.attempt_ring import AttemptRing, Episode
 
+LOOK_EVERY = 16  # steps; each look waits for the device once
+ENGINE_PACKAGES = {
+    "warp": ("mujoco-warp", "warp-lang"),
+    "brax": ("mujoco-mjx", "jax", "brax"),
+}
 GRACE_S = 0.25  # s; 15 steps at 60 Hz, as the criteria define it
 
 
@@ -47,19 +54,6 @@ class Attempt:
     frame: int
 
 
-@dataclass
-class _Track:
-    """Open recording of one world."""
-
-    qpos0: np.ndarray
-    qvel0: np.ndarray
-    qpos: list[np.ndarray] = field(default_factory=list)
-    qvel: list[np.ndarray] = field(default_factory=list)
-    ctrl: list[np.ndarray] = field(default_factory=list)
-    actions: list[np.ndarray] = field(default_factory=list)
-    wrench: list[np.ndarray] = field(default_factory=list)
-
-
 class AttemptRecorder:
     """Follows the attempt worlds of an environment, step by step.
 
@@ -67,10 +61,13 @@ class AttemptRecorder:
     reset that follows it.
 
     Args:
-        env: the environment, on the CPU engine.
+        env: the environment.
         criterion: what the rollouts are judged by.
         seed: of the run.
+        engine: physics engine, stored with the rollouts.
         provenance: hashes of recipe and library, date; stored with every rollout.
+        look_every: steps between two looks for finished episodes; every step on the
+            cpu, every ``LOOK_EVERY`` on a device when None.
     """
 
     def __init__(
@@ -79,129 +76,113 @@ class AttemptRecorder:
         *,
         criterion: str,
         seed: int,
+        engine: str = "cpu",
         provenance: dict[str, str] | None = None,
+        look_every: int | None = None,
     ) -> None:
-        if not isinstance(env.physics, CpuPhysics):
-            msg = "attempts are recorded on the cpu engine only"
-            raise TypeError(msg)
-        self.env, self.physics = env, env.physics
-        self.criterion, self.seed = criterion, seed
+        self.env, self.criterion, self.seed = env, criterion, seed
         self.provenance = json.dumps(provenance or {})
-        self._tracks: dict[int, _Track] = {}
+        self.versions = json.dumps(versions(engine, env.device))
+        if look_every is None:
+            look_every = 1 if env.device.type == "cpu" else LOOK_EVERY
+        self.ring = AttemptRing(env, look_every=look_every)
+        self._env_steps: deque[int] = deque(maxlen=look_every)
 
-    def begin(self, env_ids: Tensor) -> None:
-        """Start recordings of the attempt worlds among ``env_ids``."""
-        for env in env_ids.tolist():
-            if self.env.attempt[env]:
-                qpos, qvel, _ = self.physics.raw_state(env)
-                self._tracks[env] = _Track(qpos, qvel)
+    def begin(self) -> None:
+        """Keep the states after a reset; those of worlds that go on change nothing."""
+        self.ring.begin()
 
     def step(
         self, action: Tensor, next_td: TensorDictBase, env_steps: int
     ) -> list[Attempt]:
-        """Record one step; return the attempts that it finished.
+        """Record one step; return attempts that are known to be finished.
 
         Args:
             action: (N, 2, J).
             next_td: ``next`` entry of the step.
             env_steps: counter of the run.
         """
-        finished = []
-        done = next_td[keys.DONE].squeeze(-1)
-        for env, track in self._tracks.items():
-            qpos, qvel, ctrl = self.physics.raw_state(env)
-            track.qpos.append(qpos)
-            track.qvel.append(qvel)
-            track.ctrl.append(ctrl)
-            track.wrench.append(self.physics.applied_wrench(env))
-            track.actions.append(action[env].numpy().copy())
-            if done[env]:
-                finished.append(self._finish(env, track, env_steps))
-        for env in done.nonzero().squeeze(-1).tolist():
-            self._tracks.pop(env, None)
-        return finished
+        self.ring.step(action, next_td[keys.DONE])
+        self._env_steps.append(env_steps)
+        return self.flush() if self.ring.due else []
 
-    def _finish(self, env: int, track: _Track, env_steps: int) -> Attempt:
-        info = self.env.info
-        assert info is not None
-        motion = int(info.motion[env])
+    def flush(self) -> list[Attempt]:
+        """Attempts that have finished since the last look; waits for the device."""
+        found = self.ring.look()
+        behind = self.ring.written - 1  # step of the newest counter
+        return [self._finish(e, self._env_steps[-1 - (behind - e.last)]) for e in found]
+
+    def _finish(self, episode: Episode, env_steps: int) -> Attempt:
         why = [
             {"cause": name, "hand": side}
-            for name, mask in info.outcome.causes.items()
-            for i, side in enumerate(keys.SIDES)
-            if mask[env, i]
+            for name, blamed in episode.causes.items()
+            for side, is_blamed in zip(keys.SIDES, blamed, strict=True)
+            if is_blamed
         ]
-        rollout = self._rollout(env, track, motion, env_steps)
-        frame = int(info.frame[env])
+        rollout = self._rollout(episode, env_steps)
         # A time-out before the end of the motion is no failure, but not complete.
-        ended = frame >= int(self.env.bank.length[motion]) - 1
-        return Attempt(rollout, motion, not why and ended, why, frame)
+        ended = episode.frame >= self._length(episode.motion) - 1
+        complete = not why and ended
+        return Attempt(rollout, episode.motion, complete, why, episode.frame)
 
-    def _rollout(self, env: int, track: _Track, motion: int, env_steps: int) -> Rollout:
-        physics, bank = self.physics, self.env.bank
-        scene = physics.scene(env)
-        qpos, qvel = np.stack(track.qpos), np.stack(track.qvel)
+    def _length(self, motion: int) -> int:
+        return int(self.env.bank.length[motion])
+
+    def _rollout(self, episode: Episode, env_steps: int) -> Rollout:
+        bank, motion = self.env.bank, episode.motion
+        scene = self.env.physics.scenes[motion]
+        qpos = episode.steps["qpos"].astype(np.float64)
         steps = len(qpos)
-        rows = torch.full((steps,), motion)
+        rows = torch.full((steps,), motion, device=self.env.device)
         # Episodes of attempt worlds start at frame 0, so step t is scored on t + 1.
-        frames = torch.arange(1, steps + 1)
+        frames = torch.arange(1, steps + 1, device=self.env.device)
         ref = bank.at(rows, frames)
-        joint_pos = np.zeros((steps, 2, bank.num_joints), np.float32)
-        for side in scene.layout.sides:
-            joint_pos[:, keys.SIDES.index(side)] = qpos[:, scene.joint_qpos(side)]
-        kin = self.env.kinematics(torch.from_numpy(joint_pos), None)
-        index = scene.layout.num_objects
-        adr = [scene.object_qpos(s) for s in range(index)]
-        present = (bank.object_index[motion] >= 0).tolist()
-        slots = bank.num_slots
-        pose = np.zeros((steps, slots, 7))
-        pose[..., 3] = 1.0
-        for slot in range(index):
-            pose[:, slot] = qpos[:, adr[slot] : adr[slot] + 7]
-        qpos_adr = [adr[s] if s < index and present[s] else -1 for s in range(slots)]
-        dof_adr = [
-            scene.object_dof(s) if qpos_adr[s] >= 0 else -1 for s in range(slots)
-        ]
+        kin = self._kinematics(scene, qpos)
         joints, ref_joints, bodies = self._joints(kin, rows, frames)
-        slot_of_hand = torch.where(
-            bank.has_object[motion], bank.hand_slot[motion], torch.tensor(-1)
-        )
+        has, slot = bank.has_object[motion], bank.hand_slot[motion]
+        objects = _objects(scene, qpos, (bank.object_index[motion] >= 0).tolist())
         fps = 1.0 / self.env.step_dt
         return Rollout(
             motion=bank.names[motion],
             hand=self.env.hands["left"].name,
             fps=fps,
-            decimation=physics.decimation,
+            decimation=self.env.physics.decimation,
             grace=grace_steps(fps),
-            qpos0=track.qpos0,
-            qvel0=track.qvel0,
-            ctrl=np.stack(track.ctrl),
+            qpos0=episode.qpos0.astype(np.float64),
+            qvel0=episode.qvel0.astype(np.float64),
+            ctrl=episode.steps["ctrl"].astype(np.float64),
             qpos=qpos,
-            qvel=qvel,
-            object_pos=pose[..., :3],
-            object_quat=pose[..., 3:],
+            qvel=episode.steps["qvel"].astype(np.float64),
+            object_pos=objects["pos"],
+            object_quat=objects["quat"],
+            object_qpos_adr=objects["qpos_adr"],
+            object_qvel_adr=objects["qvel_adr"],
             ref_object_pos=_float64(ref, "object_pos"),
             ref_object_quat=_float64(ref, "object_quat"),
             fingertips=_float64(kin, "tip_pos"),
             ref_fingertips=_float64(ref, "tip_pos"),
             joints=joints,
             ref_joints=ref_joints,
-            hand_active=bank.hand_active[motion].numpy(),
-            hand_object=slot_of_hand.numpy(),
-            object_qpos_adr=np.array(qpos_adr),
-            object_qvel_adr=np.array(dof_adr),
+            hand_active=bank.hand_active[motion].cpu().numpy(),
+            hand_object=torch.where(has, slot, -1).cpu().numpy(),
             joint_bodies=json.dumps(bodies),
             model_xml=scene.xml,
             criterion=self.criterion,
             errors="{}",
-            versions=json.dumps(versions()),
+            versions=self.versions,
             seed=self.seed,
             env_steps=env_steps,
-            actions=np.stack(track.actions),
-            num_ref_frames=int(bank.length[motion]) - 1,
-            wrench=np.stack(track.wrench),
+            actions=episode.steps["action"],
+            num_ref_frames=self._length(motion) - 1,
+            wrench=episode.steps["wrench"].astype(np.float64),
             provenance=self.provenance,
         )
+
+    def _kinematics(self, scene: Scene, qpos: np.ndarray) -> TensorDictBase:
+        joints = np.zeros((len(qpos), 2, self.env.bank.num_joints), np.float32)
+        for side in scene.layout.sides:
+            joints[:, keys.SIDES.index(side)] = qpos[:, scene.joint_qpos(side)]
+        return self.env.kinematics(torch.from_numpy(joints).to(self.env.device), None)
 
     def _joints(
         self, kin: TensorDictBase, rows: Tensor, frames: Tensor
@@ -214,21 +195,49 @@ class AttemptRecorder:
             pairs = [*hand.level1_links, *hand.distal_links]
             order = [hand.keypoint_links.index(p) for p in pairs]
             links = [link for link, _ in pairs]
-            ours.append(kin["link_pos"][:, i, links].double().numpy())
-            theirs.append(ref[:, i, order].double().numpy())
+            ours.append(kin["link_pos"][:, i, links].double().cpu().numpy())
+            theirs.append(ref[:, i, order].double().cpu().numpy())
             bodies.append([hand.link_names[link] for link in links])
         return np.stack(ours, 1), np.stack(theirs, 1), bodies
 
 
+def _objects(
+    scene: Scene, qpos: np.ndarray, present: list[bool]
+) -> dict[str, np.ndarray]:
+    """Poses of all object slots, and where they lie in qpos and qvel (-1: nowhere).
+
+    Args:
+        scene: of the motion.
+        qpos: (T, nq).
+        present: which slots hold an object.
+    """
+    slots, used = len(present), scene.layout.num_objects
+    pose = np.zeros((len(qpos), slots, 7))
+    pose[..., 3] = 1.0
+    qpos_adr, dof_adr = [-1] * slots, [-1] * slots
+    for slot in range(used):
+        adr = scene.object_qpos(slot)
+        pose[:, slot] = qpos[:, adr : adr + 7]
+        if present[slot]:
+            qpos_adr[slot], dof_adr[slot] = adr, scene.object_dof(slot)
+    return {
+        "pos": pose[..., :3],
+        "quat": pose[..., 3:],
+        "qpos_adr": np.array(qpos_adr),
+        "qvel_adr": np.array(dof_adr),
+    }
+
+
 def _float64(td: TensorDictBase, key: str) -> np.ndarray:
-    return np.asarray(td[key], dtype=np.float64)
+    return np.asarray(td[key].cpu(), dtype=np.float64)
 
 
-def versions(engine: str = "cpu") -> dict[str, Any]:
+def versions(engine: str = "cpu", device: torch.device | None = None) -> dict[str, Any]:
     """Package versions, engine and hardware that produce a rollout.
 
     Args:
         engine: physics engine of the recipe.
+        device: where it ran; the cpu when None.
     """
     names = ("flashdex", "torch", "torchrl", "tensordict")
     found: dict[str, Any] = {}
@@ -237,10 +246,15 @@ def versions(engine: str = "cpu") -> dict[str, Any]:
             found[name] = version(name)
         except ModuleNotFoundError:
             found[name] = "source"
+    for name in ENGINE_PACKAGES.get(engine, ()):
+        found[name] = version(name)
+    hardware = f"{platform.machine()}, {os.cpu_count()} CPU cores"
+    if device is not None and device.type == "cuda":
+        hardware = f"{torch.cuda.get_device_name(device)}, {hardware}"
     return {
         **found,
         "mujoco": mujoco.__version__,
         "python": platform.python_version(),
         "engine": engine,
-        "hardware": f"{platform.machine()}, {os.cpu_count()} CPU cores",
+        "hardware": hardware,
     }

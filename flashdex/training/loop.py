@@ -18,7 +18,7 @@ from flashdex.errors import RunError
 from flashdex.recipe import Recipe, dump_recipe
 from flashdex.training.alongside import Alongside
 from flashdex.training.assist_epoch import AssistEpoch
-from flashdex.training.attempts import AttemptRecorder
+from flashdex.training.attempts import Attempt, AttemptRecorder
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -74,6 +74,7 @@ class Trainer:
             env,
             criterion=recipe.train.criterion,
             seed=recipe.seed,
+            engine=recipe.physics.engine,
             provenance=provenance,
         )
         self.stats = RunningStats()
@@ -118,7 +119,7 @@ class Trainer:
     def _loop(self) -> str:
         train, total = self.recipe.train, self.recipe.total_env_steps
         td = self.env.reset()
-        self.recorder.begin(torch.arange(self.env.num_envs))
+        self.recorder.begin()
         self._last_log = last_save = time.monotonic()
         bar = Progress(self.recipe.name, total=total, done=self.env_steps)
         try:
@@ -152,7 +153,7 @@ class Trainer:
             after = td.get("next")
             self.env_steps += self.env.num_envs
             self._vector_steps += 1
-            self._judge(action, after)
+            self._judge(self.recorder.step(action, after, self.env_steps))
         terminated, done = after[keys.TERMINATED], after[keys.DONE]
         with self.stats.time("remember"):
             reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
@@ -167,16 +168,15 @@ class Trainer:
             return self._advance(td, done)
 
     def _advance(self, td: TensorDictBase, done: Tensor) -> TensorDictBase:
-        td = step_mdp(td)
-        if done.any():
-            ids = done.squeeze(-1).nonzero().squeeze(-1)
-            td.set("_reset", done.clone())
-            td = self.env.reset(td)
-            self.recorder.begin(ids)
+        # A look at the flags is free on the cpu; a device is not waited for.
+        if self.env.device.type == "cpu" and not done.any():
+            return step_mdp(td)
+        td = self.env.restart(done.squeeze(-1))
+        self.recorder.begin()
         return td
 
-    def _judge(self, action: Tensor, after: TensorDictBase) -> None:
-        for attempt in self.recorder.step(action, after, self.env_steps):
+    def _judge(self, attempts: list[Attempt]) -> None:
+        for attempt in attempts:
             converted = self.ledger.record(
                 attempt, env_steps=self.env_steps, wall_s=self.wall_s
             )

@@ -59,13 +59,19 @@ def _roll(
     target: Callable[[TrackingEnv], Tensor] | None,
 ) -> list[Attempt]:
     env = bench.make_env(num_envs=len(rows), evaluation=True)
-    env.forced_motion = rows
+    env.forced_motion = rows.to(env.device)
     env.target_override = target
-    recorder = AttemptRecorder(env, criterion=criterion, seed=bench.recipe.seed)
+    recorder = AttemptRecorder(
+        env,
+        criterion=criterion,
+        seed=bench.recipe.seed,
+        engine=bench.recipe.physics.engine,
+        look_every=1,
+    )
     td = env.reset()
-    recorder.begin(torch.arange(len(rows)))
+    recorder.begin()
     found: dict[int, Attempt] = {}
-    for _ in range(int(bench.bank.length[rows].max()) + 1):
+    for _ in range(int(bench.bank.length.cpu()[rows].max()) + 1):
         action = controller(td, env)
         for i, side in enumerate(keys.SIDES):
             td.set(keys.action(side), action[:, i])

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.cpu import CpuPhysics
+from flashdex.envs.physics.make import engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
@@ -43,7 +43,7 @@ class Workbench:
         recipe: validated recipe.
         library: prepared motions, selected ones only.
         hands: hand specs by side.
-        bank: the library as tensors.
+        bank: the library as tensors, on the device of the physics.
     """
 
     recipe: Recipe
@@ -72,7 +72,7 @@ class Workbench:
         """
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
-        physics = CpuPhysics(self.library, self.hands, recipe.physics, count)
+        physics = make_physics(self.library, self.hands, recipe.physics, count)
         return TrackingEnv(
             physics,
             self.bank,
@@ -124,11 +124,6 @@ def open_workbench(recipe: Recipe) -> Workbench:
     Raises:
         LibraryError: the library is missing, of another hand or of another rate.
     """
-    if recipe.physics.engine != "cpu":
-        raise FlashdexError(
-            f"physics.engine: '{recipe.physics.engine}' is not part of this version, "
-            "which steps MuJoCo C on the CPU. Use physics=cpu."
-        )
     hands = load_hand(recipe.hand)
     library = select_motions(_load_library(recipe), recipe)
     if library.hand != recipe.hand:
@@ -144,7 +139,8 @@ def open_workbench(recipe: Recipe) -> Workbench:
             f"physics.decimation={round(1 / (library.fps * recipe.physics.timestep))} "
             f"or prepare with --hz {1 / step_dt:g}."
         )
-    return Workbench(recipe, library, hands, ReferenceBank(library, hands))
+    bank = ReferenceBank(library, hands).to(engine_device(recipe.physics))
+    return Workbench(recipe, library, hands, bank)
 
 
 def _load_library(recipe: Recipe) -> MotionLibrary:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from engine_states import raw_state
 
 from flashdex import keys
 
@@ -43,7 +44,7 @@ def test_sensor_is_the_sum_of_contacts_with_the_own_object(make_env, hands, bank
     physics = env.physics
     twins = [mujoco.MjData(physics.scene(world).model) for world in range(3)]
     for world, data in enumerate(twins):
-        data.qpos[:], data.qvel[:], _ = physics.raw_state(world)
+        data.qpos[:], data.qvel[:], _ = raw_state(physics, world)
     generator = torch.Generator().manual_seed(0)
     touching = crowded = 0
     for frame in range(1, 26):
@@ -52,7 +53,7 @@ def test_sensor_is_the_sum_of_contacts_with_the_own_object(make_env, hands, bank
         got = physics.state()[keys.CONTACT].numpy()
         for world, data in enumerate(twins):
             model = physics.scene(world).model
-            data.ctrl[:] = physics.raw_state(world)[2]
+            data.ctrl[:] = raw_state(physics, world)[2]
             for _ in range(physics.decimation):
                 mujoco.mj_step(model, data)  # contacts of the last substep stay in data
             for side, name in enumerate(keys.SIDES):
@@ -78,7 +79,7 @@ def test_idle_hand_and_empty_slot_stay_put_untouched(make_physics, bank, side):
     ref = bank.at(motion, motion * 0)
     pose = torch.cat([ref["object_pos"], ref["object_quat"]], -1)
     physics.reset(
-        torch.arange(1),
+        torch.ones(1, dtype=torch.bool),
         motion,
         ref["joint_pos"],
         ref["joint_vel"],
@@ -88,7 +89,7 @@ def test_idle_hand_and_empty_slot_stay_put_untouched(make_physics, bank, side):
     scene, name = physics.scene(0), keys.SIDES[1 - side]
     assert not bank.hand_active[int(motion), 1 - side]
     hand, empty = scene.joint_qpos(name), scene.object_qpos(1) + np.arange(7)
-    first = physics.raw_state(0)[0]
+    first = raw_state(physics, 0)[0]
     data = mujoco.MjData(scene.model)
     bodies = {scene.model.body(n).id for n in scene.hands[name].link_names}
     bodies.add(scene.model.body("object1").id)
@@ -96,13 +97,13 @@ def test_idle_hand_and_empty_slot_stay_put_untouched(make_physics, bank, side):
     for _ in range(300):
         noise = 0.1 * torch.randn(1, 2, 18, generator=generator)
         physics.step(ref["joint_pos"] + noise)
-        data.qpos[:] = physics.raw_state(0)[0]
+        data.qpos[:] = raw_state(physics, 0)[0]
         mujoco.mj_forward(scene.model, data)
         touching = {
             int(scene.model.geom_bodyid[g]) for c in data.contact for g in c.geom
         }
         assert not touching & bodies
-    last = physics.raw_state(0)[0]
+    last = raw_state(physics, 0)[0]
     np.testing.assert_allclose(last[hand], first[hand], atol=1e-3)
     np.testing.assert_allclose(last[empty], first[empty], atol=1e-3)
     state = physics.state()

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from engine_states import raw_state, reset_worlds
 from scipy.spatial.transform import Rotation
 
 from flashdex import keys
@@ -30,7 +31,7 @@ def running(make_physics, bank):
     physics = make_physics(6, num_threads=2)
     motion = torch.tensor([0, 1, 2, 2, 1, 0])
     frame = torch.tensor([5, 10, 15, 20, 25, 30])
-    physics.reset(torch.arange(6), motion, **start(bank, motion, frame))
+    reset_worlds(physics, torch.arange(6), motion, start(bank, motion, frame))
     generator = torch.Generator().manual_seed(0)
     base = bank.at(motion, frame)["joint_pos"]
 
@@ -45,12 +46,12 @@ def test_equals_a_plain_loop_bit_for_bit(running):
     models = [physics.scene(env).model for env in range(6)]
     data = [mujoco.MjData(m) for m in models]
     for env, d in enumerate(data):
-        d.qpos[:], d.qvel[:], _ = physics.raw_state(env)
+        d.qpos[:], d.qvel[:], _ = raw_state(physics, env)
     touched = 0
     for _ in range(200):
         physics.step(targets())
         for env, d in enumerate(data):
-            qpos, qvel, d.ctrl[:] = physics.raw_state(env)
+            qpos, qvel, d.ctrl[:] = raw_state(physics, env)
             for _ in range(physics.decimation):
                 mujoco.mj_step(models[env], d)
             assert (qpos == d.qpos).all()
@@ -64,13 +65,13 @@ def test_wrench_form_equals_the_plain_form_when_it_is_zero(make_physics, bank):
     motion = torch.arange(3)
     for physics in (one, two):
         state = start(bank, motion, torch.full((3,), 8))
-        physics.reset(torch.arange(3), motion, **state)
+        reset_worlds(physics, torch.arange(3), motion, state)
     target = bank.at(motion, torch.full((3,), 12))["joint_pos"]
     for _ in range(20):
         one.step(target)
         two.step(target, lambda pose, vel: torch.zeros(3, 2, 6))
     for env in range(3):
-        for a, b in zip(one.raw_state(env), two.raw_state(env), strict=True):
+        for a, b in zip(raw_state(one, env), raw_state(two, env), strict=True):
             assert (a == b).all()
 
 
@@ -79,7 +80,7 @@ def test_wrench_acts_on_the_object_in_world_axes(make_physics, bank, library):
     state = start(bank, motion, torch.tensor([0]))
     state["object_pose"][0, :, 2] = 0.6  # in the air, away from the hands
     state["object_vel"][:] = 0
-    physics.reset(torch.arange(1), motion, **state)
+    reset_worlds(physics, torch.arange(1), motion, state)
     wrench = torch.zeros(1, 2, 6)
     wrench[0, 0] = torch.tensor([0.3, 0.0, 0.12 * 9.81, 0.0, 0.0, 0.0])
     wrench[0, 1] = torch.tensor([0.0, -0.2, 0.09 * 9.81, 0.0, 0.0, 1e-4])
@@ -97,11 +98,11 @@ def test_resetting_some_worlds_leaves_the_others_alone(running, bank):
     physics, targets = running
     for _ in range(5):
         physics.step(targets())
-    before = [physics.raw_state(env) for env in range(6)]
+    before = [raw_state(physics, env) for env in range(6)]
     ids, motion = torch.tensor([1, 4]), torch.tensor([2, 0])
-    physics.reset(ids, motion, **start(bank, motion, torch.tensor([3, 4])))
+    reset_worlds(physics, ids, motion, start(bank, motion, torch.tensor([3, 4])))
     for env in (0, 2, 3, 5):
-        for old, new in zip(before[env], physics.raw_state(env), strict=True):
+        for old, new in zip(before[env], raw_state(physics, env), strict=True):
             assert (old == new).all()
     got, wanted = physics.state(), start(bank, motion, torch.tensor([3, 4]))
     for side, world, row in ((0, 1, 0), (1, 1, 0), (1, 4, 1)):
@@ -114,21 +115,21 @@ def test_resetting_some_worlds_leaves_the_others_alone(running, bank):
 def test_worlds_do_not_depend_on_their_neighbours(running, bank):
     physics, targets = running
     rows = [targets() for _ in range(30)]
-    start_state = [physics.raw_state(env) for env in range(6)]
+    start_state = [raw_state(physics, env) for env in range(6)]
     for target in rows:
         physics.step(target)
-    free = [physics.raw_state(env)[0] for env in range(6)]
+    free = [raw_state(physics, env)[0] for env in range(6)]
     motion, frame = torch.tensor([0, 1, 2, 2, 1, 0]), torch.arange(5, 35, 5)
-    physics.reset(torch.arange(6), motion, **start(bank, motion, frame))
+    reset_worlds(physics, torch.arange(6), motion, start(bank, motion, frame))
     for env in range(6):
-        assert (physics.raw_state(env)[0] == start_state[env][0]).all()
+        assert (raw_state(physics, env)[0] == start_state[env][0]).all()
     for step, target in enumerate(rows):
         if step == 10:
             ids = torch.tensor([1, 2])
-            physics.reset(ids, ids, **start(bank, ids, ids * 0))
+            reset_worlds(physics, ids, ids, start(bank, ids, ids * 0))
         physics.step(target)
     for env in (0, 3, 4, 5):
-        assert (physics.raw_state(env)[0] == free[env]).all()
+        assert (raw_state(physics, env)[0] == free[env]).all()
 
 
 @pytest.mark.parametrize("motion", [0, 1, 2])
@@ -140,9 +141,9 @@ def test_state_round_trip_with_world_spin(make_physics, bank, motion):
     state["object_vel"] = torch.randn(
         1, 2, 6, generator=torch.Generator().manual_seed(4)
     )
-    physics.reset(torch.arange(1), rows, **state)
+    reset_worlds(physics, torch.arange(1), rows, state)
     got, scene = physics.state(), physics.scene(0)
-    qvel = physics.raw_state(0)[1]
+    qvel = raw_state(physics, 0)[1]
     for slot in range(2):
         if bank.object_index[motion, slot] < 0:
             assert not got[keys.OBJECT_VEL][0, slot].any()
@@ -163,7 +164,7 @@ def test_spin_is_what_mujoco_says_in_world_axes(running):
     for env, slot in ((0, 0), (1, 0), (2, 0), (2, 1)):
         model = physics.scene(env).model
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:], _ = physics.raw_state(env)
+        data.qpos[:], data.qvel[:], _ = raw_state(physics, env)
         mujoco.mj_forward(model, data)
         out, body = np.zeros(6), model.body(f"object{slot}").id
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, out, 0)
@@ -173,13 +174,13 @@ def test_spin_is_what_mujoco_says_in_world_axes(running):
 def test_bad_numbers_are_reported_until_the_reset(make_physics, bank):
     physics, motion = make_physics(3), torch.arange(3)
     state = start(bank, motion, motion * 0)
-    physics.reset(torch.arange(3), motion, **state)
+    reset_worlds(physics, torch.arange(3), motion, state)
     physics._qvel[1] = 1e12
     for _ in range(3):
         physics.step(state["joint_pos"])
     assert physics.state()["bad"].tolist() == [False, True, False]
     one = torch.tensor([1])
-    physics.reset(one, one, **start(bank, one, one * 0))
+    reset_worlds(physics, one, one, start(bank, one, one * 0))
     assert not physics.state()["bad"].any()
     physics.step(state["joint_pos"])
     assert not physics.state()["bad"].any()

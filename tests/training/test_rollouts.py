@@ -97,7 +97,7 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
     recorder = AttemptRecorder(env, criterion="sr_mt_obj", seed=0)
     env.forced_motion = torch.tensor([2, 1, 0, 2, 1, 0])
     td, act, found = env.reset(), shaky(0.3), []
-    recorder.begin(torch.arange(6))
+    recorder.begin()
     for step in range(110):
         if step % 20 == 0:
             env.forced_motion = (env.forced_motion + 1) % 3
@@ -108,7 +108,7 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
         found += recorder.step(action, td["next"], step)
         done = td["next", keys.DONE]
         td = env.maybe_reset(td["next"].clone())
-        recorder.begin(done.squeeze(-1).nonzero().squeeze(-1))
+        recorder.begin()
     assert len(found) > 5
     motions = {a.rollout.motion for a in found}
     assert "both" in motions

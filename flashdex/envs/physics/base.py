@@ -2,60 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-WrenchFn = Callable[[Tensor, Tensor], Tensor]
-"""Object pose (N, O, 7) and velocity (N, O, 6) to a wrench (N, O, 6), world axes."""
+from flashdex.envs.scene import Scene
+from flashdex.envs.wrench import ObjectWrench
+
+
+@dataclass(frozen=True)
+class RawState:
+    """What a rollout stores of the worlds, in the engine's own precision.
+
+    The tensors may be views of the engine's memory: clone what is kept.
+
+    Attributes:
+        qpos: (N, nq), MuJoCo's layout of ``scenes``.
+        qvel: (N, nv).
+        ctrl: (N, nu).
+        wrench: force and torque on each object slot in the last substep, world axes,
+            (N, O, 6).
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    wrench: Tensor
 
 
 class Physics(Protocol):
     """N worlds, each with the hands, objects and supports of its own motion.
 
     States are exchanged in the layout of ``flashdex.keys``: both hands and all
-    object slots are always present; what a world lacks is zero (identity pose).
+    object slots are always present; what a world lacks is zero (identity pose). All
+    tensors are float32 on ``device``, and no call waits for the device.
+
+    Attributes:
+        num_envs: worlds N.
+        device: where states live.
+        decimation: substeps of a control step.
+        step_dt: control step, s.
+        scenes: scene of each motion, of one layout.
     """
 
     num_envs: int
+    device: torch.device
+    decimation: int
+    step_dt: float
+    scenes: list[Scene]
 
     def reset(
         self,
-        env_ids: Tensor,
+        mask: Tensor,
         motion: Tensor,
         joint_pos: Tensor,
         joint_vel: Tensor,
         object_pose: Tensor,
         object_vel: Tensor,
     ) -> None:
-        """Put worlds ``env_ids`` (n,) into the given states of their motions (n,).
+        """Put the worlds of ``mask`` into the given states of their motions.
+
+        All arguments have a row a world; the rows of other worlds are ignored.
 
         Args:
-            env_ids: sorted world indices, (n,).
-            motion: motion rows, (n,).
-            joint_pos: (n, 2, J) m and rad.
-            joint_vel: (n, 2, J).
-            object_pose: (n, O, 7), world.
-            object_vel: (n, O, 6), linear and angular, world.
+            mask: worlds to reset, (N,) bool.
+            motion: motion rows, (N,).
+            joint_pos: (N, 2, J) m and rad.
+            joint_vel: (N, 2, J).
+            object_pose: (N, O, 7), world.
+            object_vel: (N, O, 6), linear and angular, world.
         """
         ...
 
-    def step(self, target: Tensor, wrench: WrenchFn | None = None) -> None:
+    def step(self, target: Tensor, wrench: ObjectWrench | None = None) -> None:
         """Advance one control step (``decimation`` substeps).
 
         Args:
             target: joint position targets, (N, 2, J).
-            wrench: applied to the objects before every substep; None applies none.
+            wrench: acts on the objects, evaluated before every substep; None is none.
         """
         ...
 
     def state(self) -> TensorDict:
         """Current joint_pos, joint_vel, object_pose, object_vel, contact, bad.
 
-        ``contact`` holds the net force and point of each link in world axes,
-        (N, 2, L, 6), of the last substep; ``bad`` marks worlds whose numbers broke
-        down since the last reset, (N,).
+        ``contact`` holds the net force of the hand's object on each link and its
+        point, world axes, (N, 2, L, 6), of the last substep; ``bad`` marks worlds whose
+        numbers broke down since the last reset, (N,).
+        """
+        ...
+
+    def raw(self) -> RawState:
+        """Current state as rollouts store it."""
+        ...
+
+    def take_overflow(self) -> dict[str, int]:
+        """Worlds that ran out of room since the last call, by kind; waits for them.
+
+        What does not fit is dropped by the engine, so their physics is wrong: contacts
+        or constraints are missing. Empty where nothing overflowed.
         """
         ...

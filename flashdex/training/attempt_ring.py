@@ -1,0 +1,137 @@
+"""The last steps of the attempt worlds, kept on the device of the physics.
+
+Reading a flag from a GPU makes the host wait for it. So every step is written to a ring
+that is longer than any episode, and the host looks at the flags once in a while: an
+episode that has ended in the meantime still lies in the ring.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flashdex.envs.tracking import TrackingEnv
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Everything that was recorded of one finished episode of T steps.
+
+    Attributes:
+        env: world.
+        last: number of its last vector step.
+        steps: name -> rows of the steps, (T, ...): qpos, qvel, ctrl, wrench, action.
+        qpos0: state that it began from, (nq,).
+        qvel0: (nv,).
+        motion: motion row.
+        frame: frame that the last step was scored on.
+        causes: termination -> which hand was blamed for the end, (2,) bool.
+    """
+
+    env: int
+    last: int
+    steps: dict[str, np.ndarray]
+    qpos0: np.ndarray
+    qvel0: np.ndarray
+    motion: int
+    frame: int
+    causes: dict[str, list[bool]]
+
+
+class AttemptRing:
+    """Records the attempt worlds of an environment.
+
+    Args:
+        env: the environment; its first ``num_attempts`` worlds are recorded.
+        look_every: steps between two looks at the flags.
+    """
+
+    def __init__(self, env: TrackingEnv, *, look_every: int) -> None:
+        self.env, self.count = env, env.num_attempts
+        self.look_every = look_every
+        self.size = env.max_episode_steps + look_every
+        self.written = 0  # vector steps recorded
+        self._looked = 0
+        self._began = [0] * self.count  # first step of the open episode of each world
+        self._rings: dict[str, Tensor] = {}
+
+    def begin(self) -> None:
+        """Keep the state that the coming step starts from."""
+        raw = self.env.physics.raw()
+        self._write("qpos0", raw.qpos)
+        self._write("qvel0", raw.qvel)
+
+    def step(self, action: Tensor, done: Tensor) -> None:
+        """Record the step that the environment has just made.
+
+        Args:
+            action: (N, 2, J).
+            done: (N, 1) bool.
+        """
+        info, raw = self.env.info, self.env.physics.raw()
+        assert info is not None
+        self._write("qpos", raw.qpos)
+        self._write("qvel", raw.qvel)
+        self._write("ctrl", raw.ctrl)
+        self._write("wrench", raw.wrench)
+        self._write("action", action)
+        self._write("motion", info.motion)
+        self._write("frame", info.frame)
+        self._write("done", done)
+        for name, blame in info.outcome.causes.items():
+            self._write(f"cause/{name}", blame)
+        self.written += 1
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to look."""
+        return self.written - self._looked >= self.look_every
+
+    def look(self) -> list[Episode]:
+        """Episodes that ended since the last look, in the order of their ends."""
+        first, self._looked = self._looked, self.written
+        if self.count == 0 or self._looked == first:
+            return []
+        columns = torch.arange(first, self._looked) % self.size
+        done = self._rings["done"][:, columns.to(self.env.device)].squeeze(-1)
+        ends = done.cpu().T.nonzero().tolist()  # by step, then by world
+        found = []
+        for step, env in ends:
+            found.append(self._take(env, self._began[env], first + step))
+            self._began[env] = first + step + 1
+        return found
+
+    def _write(self, name: str, values: Tensor) -> None:
+        values = values[: self.count]
+        if name not in self._rings:
+            shape = (self.count, self.size, *values.shape[1:])
+            self._rings[name] = values.new_zeros(shape)
+        self._rings[name][:, self.written % self.size] = values
+
+    def _take(self, env: int, first: int, last: int) -> Episode:
+        columns = torch.arange(first, last + 1) % self.size
+        columns = columns.to(self.env.device)
+
+        def rows(name: str) -> np.ndarray:
+            return self._rings[name][env, columns].cpu().numpy()
+
+        def final(name: str) -> Tensor:
+            return self._rings[name][env, last % self.size]
+
+        names = ("qpos", "qvel", "ctrl", "wrench", "action")
+        start = first % self.size
+        prefix = "cause/"
+        causes = [n for n in self._rings if n.startswith(prefix)]
+        return Episode(
+            env=env,
+            last=last,
+            steps={name: rows(name) for name in names},
+            qpos0=self._rings["qpos0"][env, start].cpu().numpy().copy(),
+            qvel0=self._rings["qvel0"][env, start].cpu().numpy().copy(),
+            motion=int(final("motion")),
+            frame=int(final("frame")),
+            causes={n.removeprefix(prefix): final(n).tolist() for n in causes},
+        )

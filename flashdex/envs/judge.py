@@ -42,6 +42,21 @@ class Outcome:
     active: Tensor
 
 
+@dataclass
+class StepInfo:
+    """What the last step was made of, for logging and for the ledger.
+
+    Attributes:
+        outcome: rewards, blame and errors of the step.
+        frame: frame each world was scored on, (N,).
+        motion: motion of each world during the step, (N,).
+    """
+
+    outcome: Outcome
+    frame: Tensor
+    motion: Tensor
+
+
 class Judge:
     """Applies the recipe's reward terms and terminations to states after a step.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from flashdex import keys
 from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
 from flashdex.envs.assist import AssistSchedule
 from flashdex.envs.contact import CODE_WIDTH, contact_code
-from flashdex.envs.judge import Judge, Outcome
+from flashdex.envs.judge import Judge, Outcome, StepInfo
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.reset import ResetDraw, draw_reset, reset_state
@@ -26,21 +25,6 @@ from flashdex.envs.wrench import ObjectWrench, hold_share
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.recipe import AssistConfig, EnvConfig
-
-
-@dataclass
-class StepInfo:
-    """What the last step was made of, for logging and for the ledger.
-
-    Attributes:
-        outcome: rewards, blame and errors of the step.
-        frame: frame each world was scored on, (N,).
-        motion: motion of each world during the step, (N,).
-    """
-
-    outcome: Outcome
-    frame: Tensor
-    motion: Tensor
 
 
 class TrackingEnv(EnvBase):
@@ -79,6 +63,8 @@ class TrackingEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([n]))
         self.physics, self.bank, self.hands, self.config = physics, bank, hands, config
         self.step_dt = step_dt
+        # Looking at a flag is free on the cpu; a device would have to be waited for.
+        self.host_sees = device.type == "cpu"
         self.group_map, self.num_envs = {side: [side] for side in keys.SIDES}, n
         self.num_attempts = n if evaluation else round(config.attempt_share * n)
         self.attempt = torch.arange(n, device=device) < self.num_attempts
@@ -132,6 +118,22 @@ class TrackingEnv(EnvBase):
         self.action_spec = action_spec(n, joints)
         self.reward_spec = reward_spec(n)
         self.full_done_spec = done_spec(n)
+
+    @property
+    def last_outcome(self) -> Outcome:
+        """How the last step was judged."""
+        assert self.info is not None, "no step yet"
+        return self.info.outcome
+
+    def put_action(self, td: TensorDictBase, action: Tensor) -> None:
+        """Write the actions of both hands, (N, 2, J), from any device into ``td``."""
+        for i, side in enumerate(keys.SIDES):
+            td.set(keys.action(side), action[:, i].to(self.device))
+
+    def load_generator(self, state: Tensor) -> None:
+        """Go on with a stored state of the generator; one of another device is not."""
+        if len(state) == len(self.generator.get_state()):
+            self.generator.set_state(state)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(0 if seed is None else seed)
@@ -262,8 +264,7 @@ class TrackingEnv(EnvBase):
         assist = self.assist if self.assist is not None and self.assist.active else None
         steps = self.config.reset_hold_s / self.step_dt
         hold = hold_share(self.steps, ~self.attempt, steps)
-        # A look at the numbers is free on the cpu; a device is not waited for.
-        holds = steps > 0 and (self.device.type != "cpu" or bool(hold.any()))
+        holds = steps > 0 and (not self.host_sees or bool(hold.any()))
         if assist is None and not holds:
             return None
         rows = self.bank.object_index[self.motion]

@@ -10,22 +10,30 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from flashdex.envs.physics.make import engine_device
+from flashdex.envs.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.files import write_atomic
 from flashdex.recipe import dump_recipe
+from flashdex.training.attempts import AttemptMaker, versions
 from flashdex.training.baselines import score_baselines
 from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
+from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder, Judging
 from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
 from flashdex.training.replay_file import ReplayLog, replay_of
 from flashdex.training.sessions import Start, begin_session
-from flashdex.training.setup import Workbench
+from flashdex.training.setup import Workbench, open_workbench
 
 _LOG = logging.getLogger(__name__)
 RECIPE, BASELINES = "recipe.yaml", "baselines.json"
+Trivial = dict[str, list[str]]
+"""Motions that a baseline already passes, and which ones do."""
 
 
 def make_trainer(
@@ -53,7 +61,9 @@ def make_trainer(
     if overrides:
         write_atomic(run_dir / RECIPE, dump_recipe(recipe))
         (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
-    ledger = _open_ledger(bench, run_dir)
+    baselines = score_baselines(bench, run_dir / BASELINES)
+    trivial = baselines.trivial(recipe.train.criterion)
+    ledger = _open_ledger(bench, run_dir, trivial)
     start = begin_session(
         run_dir,
         env_steps=state["env_steps"] if state else 0,
@@ -61,52 +71,79 @@ def make_trainer(
         overrides=overrides,
     )
     _check_ledger(ledger, state, start)
-    trainer = _join(bench, run_dir, env, learner, ledger, start, state)
+    log = MetricLog(
+        run_dir,
+        recipe,
+        wandb_id=state["wandb_id"] if state else None,
+        env_steps=start.env_steps,
+    )
+    replay = _open_replay(bench, run_dir, learner, state)
+    judging = _make_judging(bench, run_dir, env, ledger)
+    trainer = Trainer(
+        recipe,
+        run_dir,
+        env,
+        learner,
+        ledger,
+        judging,
+        log,
+        start=start,
+        replay=replay,
+    )
     if state is not None:
         trainer.load_state_dict(state)
     return trainer
 
 
-def _open_ledger(bench: Workbench, run_dir: Path) -> Ledger:
+def _open_ledger(bench: Workbench, run_dir: Path, trivial: Trivial) -> Ledger:
     recipe = bench.recipe
-    baselines = score_baselines(bench, run_dir / BASELINES)
     return Ledger(
         run_dir,
         bench.bank.names,
         criterion=recipe.train.criterion,
         seed=recipe.seed,
         engine=recipe.physics.engine,
+        on_gpu=engine_device(recipe.physics).type == "cuda",
         certify=recipe.train.certify,
-        trivial=baselines.trivial(recipe.train.criterion),
+        trivial=trivial,
     )
 
 
-def _join(
-    bench: Workbench,
-    run_dir: Path,
-    env: TrackingEnv,
-    learner: Learner,
-    ledger: Ledger,
-    start: Start,
-    state: dict[str, Any] | None,
-) -> Trainer:
-    log = MetricLog(
+def _make_judging(
+    bench: Workbench, run_dir: Path, env: TrackingEnv, ledger: Ledger
+) -> Judging:
+    """In the loop, or in a process where the physics would wait for it."""
+    recipe, provenance = bench.recipe, _provenance(bench)
+    made_by = versions(recipe.physics.engine, env.device)
+    where = recipe.train.judge
+    if where == "inline" or (where == "auto" and env.host_sees):
+        scenes = env.physics.scenes
+        maker = bench.attempt_maker(scenes, made_by=made_by, provenance=provenance)
+        return JudgeHere(ledger, maker)
+    # The process must not prepare the motions again: name the library that is used.
+    motions = dataclasses.replace(recipe.motions, library=str(bench.library.path))
+    order = JudgeOrder(
+        dataclasses.replace(recipe, motions=motions),
         run_dir,
-        bench.recipe,
-        wandb_id=state["wandb_id"] if state else None,
-        env_steps=start.env_steps,
+        made_by,
+        provenance,
+        ledger.trivial,
     )
-    return Trainer(
-        bench.recipe,
-        run_dir,
-        env,
-        learner,
-        ledger,
-        log,
-        start=start,
-        replay=_open_replay(bench, run_dir, learner, state),
-        provenance=_provenance(bench),
+    return JudgeBeside(ledger, order, start_judge)
+
+
+def start_judge(order: JudgeOrder) -> tuple[Ledger, AttemptMaker]:
+    """Build ledger and maker in the judging process.
+
+    Args:
+        order: what the run told it.
+    """
+    bench = open_workbench(order.recipe, device=torch.device("cpu"))
+    scenes = build_scenes(bench.library, bench.hands, order.recipe.physics)
+    maker = bench.attempt_maker(
+        scenes, made_by=order.made_by, provenance=order.provenance
     )
+    return _open_ledger(bench, order.run_dir, order.trivial), maker
 
 
 def _provenance(bench: Workbench) -> dict[str, str]:

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 
+LOOK_EVERY = 16  # steps; each look waits for the device once
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -22,7 +24,7 @@ class Episode:
 
     Attributes:
         env: world.
-        last: number of its last vector step.
+        env_steps: counter of the run at its last step.
         steps: name -> rows of the steps, (T, ...): qpos, qvel, ctrl, wrench, action.
         qpos0: state that it began from, (nq,).
         qvel0: (nv,).
@@ -32,7 +34,7 @@ class Episode:
     """
 
     env: int
-    last: int
+    env_steps: int
     steps: dict[str, np.ndarray]
     qpos0: np.ndarray
     qvel0: np.ndarray
@@ -44,17 +46,23 @@ class Episode:
 class AttemptRing:
     """Records the attempt worlds of an environment.
 
+    Call ``begin`` after resets and ``step`` after each environment step, before the
+    reset that follows it.
+
     Args:
         env: the environment; its first ``num_attempts`` worlds are recorded.
-        look_every: steps between two looks at the flags.
+        look_every: steps between two looks at the flags; when None every step where
+            that is free, every ``LOOK_EVERY`` where the host would wait.
     """
 
-    def __init__(self, env: TrackingEnv, *, look_every: int) -> None:
+    def __init__(self, env: TrackingEnv, *, look_every: int | None = None) -> None:
         self.env, self.count = env, env.num_attempts
+        if look_every is None:
+            look_every = 1 if env.host_sees else LOOK_EVERY
         self.look_every = look_every
         self.size = env.max_episode_steps + look_every
         self.written = 0  # vector steps recorded
-        self._looked = 0
+        self._env_steps: list[int] = []  # of the steps since the last look
         self._began = [0] * self.count  # first step of the open episode of each world
         self._rings: dict[str, Tensor] = {}
 
@@ -64,12 +72,16 @@ class AttemptRing:
         self._write("qpos0", raw.qpos)
         self._write("qvel0", raw.qvel)
 
-    def step(self, action: Tensor, done: Tensor) -> None:
+    def step(self, action: Tensor, done: Tensor, env_steps: int) -> list[Episode]:
         """Record the step that the environment has just made.
 
         Args:
             action: (N, 2, J).
             done: (N, 1) bool.
+            env_steps: counter of the run.
+
+        Returns:
+            Episodes that are now known to have ended.
         """
         info, raw = self.env.info, self.env.physics.raw()
         assert info is not None
@@ -84,24 +96,23 @@ class AttemptRing:
         for name, blame in info.outcome.causes.items():
             self._write(f"cause/{name}", blame)
         self.written += 1
-
-    @property
-    def due(self) -> bool:
-        """Whether it is time to look."""
-        return self.written - self._looked >= self.look_every
+        self._env_steps.append(env_steps)
+        return self.look() if len(self._env_steps) == self.look_every else []
 
     def look(self) -> list[Episode]:
         """Episodes that ended since the last look, in the order of their ends."""
-        first, self._looked = self._looked, self.written
-        if self.count == 0 or self._looked == first:
+        counters, self._env_steps = self._env_steps, []
+        if self.count == 0 or not counters:
             return []
-        columns = torch.arange(first, self._looked) % self.size
+        first = self.written - len(counters)
+        columns = torch.arange(first, self.written) % self.size
         done = self._rings["done"][:, columns.to(self.env.device)].squeeze(-1)
         ends = done.cpu().T.nonzero().tolist()  # by step, then by world
         found = []
         for step, env in ends:
-            found.append(self._take(env, self._began[env], first + step))
-            self._began[env] = first + step + 1
+            last = first + step
+            found.append(self._take(env, self._began[env], last, counters[step]))
+            self._began[env] = last + 1
         return found
 
     def _write(self, name: str, values: Tensor) -> None:
@@ -111,7 +122,7 @@ class AttemptRing:
             self._rings[name] = values.new_zeros(shape)
         self._rings[name][:, self.written % self.size] = values
 
-    def _take(self, env: int, first: int, last: int) -> Episode:
+    def _take(self, env: int, first: int, last: int, env_steps: int) -> Episode:
         columns = torch.arange(first, last + 1) % self.size
         columns = columns.to(self.env.device)
 
@@ -127,7 +138,7 @@ class AttemptRing:
         causes = [n for n in self._rings if n.startswith(prefix)]
         return Episode(
             env=env,
-            last=last,
+            env_steps=env_steps,
             steps={name: rows(name) for name in names},
             qpos0=self._rings["qpos0"][env, start].cpu().numpy().copy(),
             qvel0=self._rings["qvel0"][env, start].cpu().numpy().copy(),

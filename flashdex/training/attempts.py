@@ -1,11 +1,10 @@
-"""Records attempt worlds, so that a finished episode becomes a storable rollout."""
+"""From a recorded episode of an attempt world to a storable rollout."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-from collections import deque
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -17,12 +16,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex import keys
+from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene import Scene
-from flashdex.envs.tracking import TrackingEnv
+from flashdex.hands.kinematics import HandKinematics
+from flashdex.hands.spec import HandSpec
 from flashdex.metrics.rollout import Rollout
-from flashdex.training.attempt_ring import AttemptRing, Episode
+from flashdex.training.attempt_ring import Episode
 
-LOOK_EVERY = 16  # steps; each look waits for the device once
 ENGINE_PACKAGES = {
     "warp": ("mujoco-warp", "warp-lang"),
     "brax": ("mujoco-mjx", "jax", "brax"),
@@ -54,100 +54,74 @@ class Attempt:
     frame: int
 
 
-class AttemptRecorder:
-    """Follows the attempt worlds of an environment, step by step.
-
-    Call ``begin`` after resets and ``step`` after each environment step, before the
-    reset that follows it.
+class AttemptMaker:
+    """Turns recorded episodes into storable rollouts, on the cpu.
 
     Args:
-        env: the environment.
+        bank: reference frames, on the cpu.
+        hands: hand specs by side.
+        scenes: scene of each motion.
+        decimation: physics substeps of a control step.
         criterion: what the rollouts are judged by.
         seed: of the run.
-        engine: physics engine, stored with the rollouts.
+        made_by: engine, versions and hardware, from ``versions``.
         provenance: hashes of recipe and library, date; stored with every rollout.
-        look_every: steps between two looks for finished episodes; every step on the
-            cpu, every ``LOOK_EVERY`` on a device when None.
     """
 
     def __init__(
         self,
-        env: TrackingEnv,
+        bank: ReferenceBank,
+        hands: dict[keys.Side, HandSpec],
+        scenes: list[Scene],
         *,
+        decimation: int,
         criterion: str,
         seed: int,
-        engine: str = "cpu",
+        made_by: dict[str, Any],
         provenance: dict[str, str] | None = None,
-        look_every: int | None = None,
     ) -> None:
-        self.env, self.criterion, self.seed = env, criterion, seed
+        self.bank, self.hands, self.scenes = bank, hands, scenes
+        self.kinematics = HandKinematics(hands)
+        self.decimation, self.criterion, self.seed = decimation, criterion, seed
+        self.made_by = json.dumps(made_by)
         self.provenance = json.dumps(provenance or {})
-        self.versions = json.dumps(versions(engine, env.device))
-        if look_every is None:
-            look_every = 1 if env.device.type == "cpu" else LOOK_EVERY
-        self.ring = AttemptRing(env, look_every=look_every)
-        self._env_steps: deque[int] = deque(maxlen=look_every)
 
-    def begin(self) -> None:
-        """Keep the states after a reset; those of worlds that go on change nothing."""
-        self.ring.begin()
-
-    def step(
-        self, action: Tensor, next_td: TensorDictBase, env_steps: int
-    ) -> list[Attempt]:
-        """Record one step; return attempts that are known to be finished.
-
-        Args:
-            action: (N, 2, J).
-            next_td: ``next`` entry of the step.
-            env_steps: counter of the run.
-        """
-        self.ring.step(action, next_td[keys.DONE])
-        self._env_steps.append(env_steps)
-        return self.flush() if self.ring.due else []
-
-    def flush(self) -> list[Attempt]:
-        """Attempts that have finished since the last look; waits for the device."""
-        found = self.ring.look()
-        behind = self.ring.written - 1  # step of the newest counter
-        return [self._finish(e, self._env_steps[-1 - (behind - e.last)]) for e in found]
-
-    def _finish(self, episode: Episode, env_steps: int) -> Attempt:
+    def make(self, episode: Episode) -> Attempt:
+        """Return the attempt that an episode of an attempt world was."""
         why = [
             {"cause": name, "hand": side}
             for name, blamed in episode.causes.items()
             for side, is_blamed in zip(keys.SIDES, blamed, strict=True)
             if is_blamed
         ]
-        rollout = self._rollout(episode, env_steps)
+        rollout = self._rollout(episode)
         # A time-out before the end of the motion is no failure, but not complete.
         ended = episode.frame >= self._length(episode.motion) - 1
         complete = not why and ended
         return Attempt(rollout, episode.motion, complete, why, episode.frame)
 
     def _length(self, motion: int) -> int:
-        return int(self.env.bank.length[motion])
+        return int(self.bank.length[motion])
 
-    def _rollout(self, episode: Episode, env_steps: int) -> Rollout:
-        bank, motion = self.env.bank, episode.motion
-        scene = self.env.physics.scenes[motion]
+    def _rollout(self, episode: Episode) -> Rollout:
+        bank, motion = self.bank, episode.motion
+        scene = self.scenes[motion]
         qpos = episode.steps["qpos"].astype(np.float64)
         steps = len(qpos)
-        rows = torch.full((steps,), motion, device=self.env.device)
+        rows = torch.full((steps,), motion)
         # Episodes of attempt worlds start at frame 0, so step t is scored on t + 1.
-        frames = torch.arange(1, steps + 1, device=self.env.device)
+        frames = torch.arange(1, steps + 1)
         ref = bank.at(rows, frames)
         kin = self._kinematics(scene, qpos)
         joints, ref_joints, bodies = self._joints(kin, rows, frames)
         has, slot = bank.has_object[motion], bank.hand_slot[motion]
         objects = _objects(scene, qpos, (bank.object_index[motion] >= 0).tolist())
-        fps = 1.0 / self.env.step_dt
         return Rollout(
             motion=bank.names[motion],
-            hand=self.env.hands["left"].name,
-            fps=fps,
-            decimation=self.env.physics.decimation,
-            grace=grace_steps(fps),
+            hand=self.hands["left"].name,
+            fps=bank.fps,
+            decimation=self.decimation,
+            grace=grace_steps(bank.fps),
             qpos0=episode.qpos0.astype(np.float64),
             qvel0=episode.qvel0.astype(np.float64),
             ctrl=episode.steps["ctrl"].astype(np.float64),
@@ -163,15 +137,15 @@ class AttemptRecorder:
             ref_fingertips=_float64(ref, "tip_pos"),
             joints=joints,
             ref_joints=ref_joints,
-            hand_active=bank.hand_active[motion].cpu().numpy(),
-            hand_object=torch.where(has, slot, -1).cpu().numpy(),
+            hand_active=bank.hand_active[motion].numpy(),
+            hand_object=torch.where(has, slot, -1).numpy(),
             joint_bodies=json.dumps(bodies),
             model_xml=scene.xml,
             criterion=self.criterion,
             errors="{}",
-            versions=self.versions,
+            versions=self.made_by,
             seed=self.seed,
-            env_steps=env_steps,
+            env_steps=episode.env_steps,
             actions=episode.steps["action"],
             num_ref_frames=self._length(motion) - 1,
             wrench=episode.steps["wrench"].astype(np.float64),
@@ -179,24 +153,24 @@ class AttemptRecorder:
         )
 
     def _kinematics(self, scene: Scene, qpos: np.ndarray) -> TensorDictBase:
-        joints = np.zeros((len(qpos), 2, self.env.bank.num_joints), np.float32)
+        joints = np.zeros((len(qpos), 2, self.bank.num_joints), np.float32)
         for side in scene.layout.sides:
             joints[:, keys.SIDES.index(side)] = qpos[:, scene.joint_qpos(side)]
-        return self.env.kinematics(torch.from_numpy(joints).to(self.env.device), None)
+        return self.kinematics(torch.from_numpy(joints), None)
 
     def _joints(
         self, kin: TensorDictBase, rows: Tensor, frames: Tensor
     ) -> tuple[np.ndarray, np.ndarray, list[list[str]]]:
         """Level-1 and distal links, their human keypoints, and the body names."""
-        ref = self.env.bank.at(rows, frames, ("link_pos",))["link_pos"]
+        ref = self.bank.at(rows, frames, ("link_pos",))["link_pos"]
         ours, theirs, bodies = [], [], []
         for i, side in enumerate(keys.SIDES):
-            hand = self.env.hands[side]
+            hand = self.hands[side]
             pairs = [*hand.level1_links, *hand.distal_links]
             order = [hand.keypoint_links.index(p) for p in pairs]
             links = [link for link, _ in pairs]
-            ours.append(kin["link_pos"][:, i, links].double().cpu().numpy())
-            theirs.append(ref[:, i, order].double().cpu().numpy())
+            ours.append(kin["link_pos"][:, i, links].double().numpy())
+            theirs.append(ref[:, i, order].double().numpy())
             bodies.append([hand.link_names[link] for link in links])
         return np.stack(ours, 1), np.stack(theirs, 1), bodies
 
@@ -229,7 +203,7 @@ def _objects(
 
 
 def _float64(td: TensorDictBase, key: str) -> np.ndarray:
-    return np.asarray(td[key].cpu(), dtype=np.float64)
+    return np.asarray(td[key], dtype=np.float64)
 
 
 def versions(engine: str = "cpu", device: torch.device | None = None) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
     for name, target in BASELINES.items():
         criterion = bench.recipe.train.criterion
         rows[name] = {}
-        for attempt in roll_all(bench, idle, criterion=criterion, target=target):
+        for attempt in roll_all(bench, idle, target=target):
             verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
             verdict = verdicts[criterion]
             rows[name][attempt.rollout.motion] = {

@@ -60,7 +60,7 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> Evaluation:
         return learner.act(td, explore=False)
 
     criterion = recipe.train.criterion
-    attempts = roll_all(bench, act, criterion=criterion, env_steps=state["env_steps"])
+    attempts = roll_all(bench, act, env_steps=state["env_steps"])
     rows, errors = [], []
     for attempt in attempts:
         signals = attempt.rollout.signals()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -12,10 +13,12 @@ class Learner(Protocol):
     """Acts, remembers and learns; knows states and actions, but no simulator.
 
     Attributes:
+        device: where it acts and learns.
         is_off_policy: it may learn between acting and remembering the outcome; an
             on-policy learner must not change before the rollout is complete.
     """
 
+    device: torch.device
     is_off_policy: bool
 
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:

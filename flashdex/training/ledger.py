@@ -54,6 +54,7 @@ class Ledger:
         criterion: what counts as a conversion.
         seed: of the run.
         engine: physics engine of the rollouts.
+        on_gpu: a GPU steps the physics, so that its seconds count.
         certify: replay conversions and write the certificate.
         trivial: motions that a baseline already passes.
     """
@@ -66,6 +67,7 @@ class Ledger:
         criterion: str,
         seed: int,
         engine: str,
+        on_gpu: bool = False,
         certify: bool = True,
         trivial: dict[str, list[str]] | None = None,
     ) -> None:
@@ -73,10 +75,12 @@ class Ledger:
         self.rollouts = run_dir / ROLLOUTS
         self.rollouts.mkdir(parents=True, exist_ok=True)
         self.names, self.criterion, self.seed = names, criterion, seed
-        self.engine, self.certify, self.trivial = engine, certify, trivial or {}
+        self.engine, self.on_gpu = engine, on_gpu
+        self.certify, self.trivial = certify, trivial or {}
         self.conversions: dict[str, Conversion] = {}
         self.last: dict[str, bool] = {}
         self.attempts: dict[str, int] = dict.fromkeys(names, 0)
+        self.last_line: dict[str, Any] = {}
         self._read()
 
     def _read(self) -> None:
@@ -141,7 +145,7 @@ class Ledger:
             "frame": attempt.frame,
             "env_steps": env_steps,
             "wall_s": round(wall_s, 3),
-            "gpu_s": 0.0,
+            "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
             "trivial": self.trivial.get(name, []),
@@ -149,8 +153,21 @@ class Ledger:
         if first or unproven:
             line.update(self._store(attempt, line))
         append_line(self.path, line)
+        self.last_line = line
+        return self.take(line)
+
+    def take(self, line: dict[str, Any]) -> Conversion | None:
+        """Count a line that is in the file, written here or by another process.
+
+        Args:
+            line: of one attempt.
+
+        Returns:
+            The conversion, if it is the motion's first.
+        """
+        known = line["motion"] in self.conversions
         self._count(line)
-        return self.conversions[name] if first else None
+        return None if known else self.conversions.get(line["motion"])
 
     def _store(self, attempt: Attempt, line: dict[str, Any]) -> dict[str, Any]:
         rollout = attempt.rollout
@@ -214,6 +231,11 @@ class Ledger:
         return f"{text}, {self.num_certified} certified" if self.conversions else text
 
     @property
+    def num_attempts(self) -> int:
+        """Attempts of all motions."""
+        return sum(self.attempts.values())
+
+    @property
     def num_converted(self) -> int:
         """Motions with at least one passing attempt."""
         return len(self.conversions)
@@ -238,7 +260,7 @@ class Ledger:
             "convert/last": passing / total,
             "convert/certified": float(self.num_certified),
             "convert/robust": float(self.num_robust),
-            "convert/attempts": float(sum(self.attempts.values())),
+            "convert/attempts": float(self.num_attempts),
         }
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours

@@ -18,7 +18,7 @@ from flashdex.errors import RunError
 from flashdex.recipe import Recipe, dump_recipe
 from flashdex.training.alongside import Alongside
 from flashdex.training.assist_epoch import AssistEpoch
-from flashdex.training.attempts import Attempt, AttemptRecorder
+from flashdex.training.attempt_ring import AttemptRing, Episode
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -26,11 +26,13 @@ from flashdex.training.guard import (
     first_non_finite,
     numeric_errors,
 )
+from flashdex.training.judging import Judging
 from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.nan_dump import stop_with_dump
 from flashdex.training.progress import Progress
+from flashdex.training.record import make_record
 from flashdex.training.replay_file import ReplayLog
 from flashdex.training.sessions import SIGNAL, Start
 from flashdex.training.signals import StopSignals
@@ -47,11 +49,11 @@ class Trainer:
         run_dir: run directory.
         env: tracking environment.
         learner: acts and learns.
-        ledger: judges attempts.
+        ledger: what was achieved.
+        judging: judges attempts for the ledger.
         log: metric writers.
         start: where the session begins.
         replay: stores replay rows with the checkpoints, or None.
-        provenance: stored with every rollout.
     """
 
     def __init__(
@@ -61,30 +63,26 @@ class Trainer:
         env: TrackingEnv,
         learner: Learner,
         ledger: Ledger,
+        judging: Judging,
         log: MetricLog,
         *,
         start: Start,
         replay: ReplayLog | None = None,
-        provenance: dict[str, str] | None = None,
     ) -> None:
         self.recipe, self.run_dir, self.env = recipe, run_dir, env
         self.learner, self.ledger, self.log = learner, ledger, log
         self.start, self.replay = start, replay
-        self.recorder = AttemptRecorder(
-            env,
-            criterion=recipe.train.criterion,
-            seed=recipe.seed,
-            engine=recipe.physics.engine,
-            provenance=provenance,
-        )
+        self.judging, self.attempts = judging, AttemptRing(env)
         self.stats = RunningStats()
         self.assist_epoch = AssistEpoch()
         self.guard = GradientGuard()
-        self.alongside = Alongside(threaded=recipe.train.overlap)
+        # A device takes its work in one line: a second thread would only stand by it.
+        self.alongside = Alongside(threaded=recipe.train.overlap and env.host_sees)
         self.stop = StopSignals()
         self.env_steps = start.env_steps
         self._vector_steps = 0
-        self._saved_at = self._logged_at = start.env_steps
+        self._saved_at = start.env_steps
+        self._logged = (start.env_steps, ledger.num_attempts)
         self._last_record: dict[str, float] = {}
         self._began = time.monotonic()
 
@@ -104,6 +102,7 @@ class Trainer:
         try:
             with self.stop, self.guard:
                 why = self._loop()
+                self._judge(self.attempts.look(), wait=True)
                 self._write_log()
                 self.save()
         except NonFiniteError as error:
@@ -119,7 +118,7 @@ class Trainer:
     def _loop(self) -> str:
         train, total = self.recipe.train, self.recipe.total_env_steps
         td = self.env.reset()
-        self.recorder.begin()
+        self.attempts.begin()
         self._last_log = last_save = time.monotonic()
         bar = Progress(self.recipe.name, total=total, done=self.env_steps)
         try:
@@ -142,9 +141,8 @@ class Trainer:
     def vector_step(self, td: TensorDictBase) -> TensorDictBase:
         """One step of all worlds, with the updates that belong to it."""
         with self.stats.time("act"):
-            action = self.learner.act(td)
-            for i, side in enumerate(keys.SIDES):
-                td.set(keys.action(side), action[:, i])
+            action = self.learner.act(td.to(self.learner.device))
+            self.env.put_action(td, action)
         # The updates read rows and write weights, the step does neither.
         beside = self._learn if self.learner.is_off_policy else None
         with self.alongside.run(beside):
@@ -153,35 +151,42 @@ class Trainer:
             after = td.get("next")
             self.env_steps += self.env.num_envs
             self._vector_steps += 1
-            self._judge(self.recorder.step(action, after, self.env_steps))
-        terminated, done = after[keys.TERMINATED], after[keys.DONE]
+            terminated, done = after[keys.TERMINATED], after[keys.DONE]
+            self._judge(self.attempts.step(action, done, self.env_steps))
         with self.stats.time("remember"):
-            reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
-            self.learner.remember(td, action, reward, after, terminated, done)
+            self._remember(td, action)
         if not self.learner.is_off_policy:
             self._learn()
-        assert self.env.info is not None
-        outcome = self.env.info.outcome
+        outcome = self.env.last_outcome
         self.stats.add_step(outcome, done, terminated)
         self.assist_epoch.step(self.env, outcome, done, terminated, self._vector_steps)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
     def _advance(self, td: TensorDictBase, done: Tensor) -> TensorDictBase:
-        # A look at the flags is free on the cpu; a device is not waited for.
-        if self.env.device.type == "cpu" and not done.any():
+        if self.env.host_sees and not done.any():
             return step_mdp(td)
         td = self.env.restart(done.squeeze(-1))
-        self.recorder.begin()
+        self.attempts.begin()
         return td
 
-    def _judge(self, attempts: list[Attempt]) -> None:
-        for attempt in attempts:
-            converted = self.ledger.record(
-                attempt, env_steps=self.env_steps, wall_s=self.wall_s
-            )
-            if converted is not None:
-                self._mark_converted(converted.motion)
+    def _remember(self, td: TensorDictBase, action: Tensor) -> None:
+        device = self.learner.device
+        after = td.get("next").to(device)
+        self.learner.remember(
+            td.exclude("next").to(device),
+            action.to(device),
+            torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1),
+            after,
+            after[keys.TERMINATED],
+            after[keys.DONE],
+        )
+
+    def _judge(self, episodes: list[Episode], *, wait: bool = False) -> None:
+        for episode in episodes:
+            self.judging.submit(episode, self.wall_s)
+        for conversion in self.judging.collect(wait=wait):
+            self._mark_converted(conversion.motion)
 
     def _mark_converted(self, name: str) -> None:
         row = self.env.bank.names.index(name)
@@ -207,28 +212,27 @@ class Trainer:
         return ""
 
     def _write_log(self) -> None:
-        if self.env_steps == self._logged_at:
+        counters = (self.env_steps, self.ledger.num_attempts)
+        if counters == self._logged:
             return  # a clean stop has just logged, or a resume has nothing left to do
-        record: dict[str, Any] = {
-            "env_steps": self.env_steps,
-            "env_steps_lost": self.start.lost,
-            "hours": self.wall_s / 3600,
-            "updates": self.learner.updates,
-        }
-        record.update(self.ledger.metrics(self.wall_s / 3600))
         now = time.monotonic()
         seconds = max(now - self._last_log, 1e-9)
+        record = make_record(
+            env_steps=self.env_steps,
+            lost=self.start.lost,
+            wall_s=self.wall_s,
+            env=self.env,
+            learner=self.learner,
+            ledger=self.ledger,
+            judging=self.judging,
+        )
         record.update(self.stats.pop(seconds, self.env.num_envs))
-        record["buffer/rows"] = self.learner.num_rows
-        record["buffer/dropped"] = getattr(self.learner, "num_dropped", 0)
-        assist = self.env.assist
-        record["assist/level"] = assist.upper[0] if assist is not None else 0.0
         self._last_record = {k: float(v) for k, v in record.items()}
         self.guard.check()
         if bad := first_non_finite(self._last_record):
             raise NonFiniteError(bad)
         self.log.write(record)
-        self._last_log, self._logged_at = now, self.env_steps
+        self._last_log, self._logged = now, counters
 
     def _dump(self, what: str) -> RunError:
         return stop_with_dump(
@@ -257,6 +261,7 @@ class Trainer:
         if self.env_steps == self._saved_at:
             return
         self.guard.check()
+        self._judge(self.attempts.look(), wait=True)  # the ledger says all, then
         state = self.state_dict()
         if bad := first_non_finite(state["learner"]):
             raise NonFiniteError(bad)
@@ -292,5 +297,5 @@ class Trainer:
         if self.env.assist is not None and state["assist"] is not None:
             self.env.assist.load_state_dict(state["assist"])
             self.env.redraw_assist()
-        self.env.generator.set_state(state["env_generator"])
+        self.env.load_generator(state["env_generator"])
         torch.set_rng_state(state["torch_rng"])

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.training.attempts import Attempt, AttemptRecorder
+from flashdex.training.attempt_ring import AttemptRing
+from flashdex.training.attempts import Attempt
 from flashdex.training.setup import Workbench
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]
@@ -22,7 +22,6 @@ def roll_all(
     bench: Workbench,
     controller: Controller,
     *,
-    criterion: str,
     env_steps: int = 0,
     worlds: int = 32,
     target: Callable[[TrackingEnv], Tensor] | None = None,
@@ -32,7 +31,6 @@ def roll_all(
     Args:
         bench: motions and recipe.
         controller: what acts.
-        criterion: stored with the rollouts.
         env_steps: counter stored with the rollouts.
         worlds: motions rolled side by side.
         target: joint position targets (N, 2, J) that replace those of the action, for
@@ -45,7 +43,7 @@ def roll_all(
     out: list[Attempt] = []
     for first in range(0, total, worlds):
         rows = torch.arange(first, min(first + worlds, total))
-        out += _roll(bench, controller, rows, criterion, env_steps, target)
+        out += _roll(bench, controller, rows, env_steps, target)
     return out
 
 
@@ -54,31 +52,26 @@ def _roll(
     bench: Workbench,
     controller: Controller,
     rows: Tensor,
-    criterion: str,
     env_steps: int,
     target: Callable[[TrackingEnv], Tensor] | None,
 ) -> list[Attempt]:
     env = bench.make_env(num_envs=len(rows), evaluation=True)
     env.forced_motion = rows.to(env.device)
     env.target_override = target
-    recorder = AttemptRecorder(
-        env,
-        criterion=criterion,
-        seed=bench.recipe.seed,
-        engine=bench.recipe.physics.engine,
-        look_every=1,
+    ring, maker = (
+        AttemptRing(env, look_every=1),
+        bench.attempt_maker(env.physics.scenes),
     )
     td = env.reset()
-    recorder.begin()
+    ring.begin()
     found: dict[int, Attempt] = {}
-    for _ in range(int(bench.bank.length.cpu()[rows].max()) + 1):
+    while len(found) < len(rows):
         action = controller(td, env)
-        for i, side in enumerate(keys.SIDES):
-            td.set(keys.action(side), action[:, i])
-        td = env.step(td)
-        for attempt in recorder.step(action, td["next"], env_steps):
-            found.setdefault(attempt.motion, attempt)
-        if len(found) == len(rows):
-            break
-        td = step_mdp(td)
+        env.put_action(td, action)
+        done = env.step(td)["next", keys.DONE]
+        for episode in ring.step(action, done, env_steps):
+            if episode.motion not in found:  # short motions begin again
+                found[episode.motion] = maker.make(episode)
+        td = env.restart(done.squeeze(-1))
+        ring.begin()
     return [found[r] for r in rows.tolist()]

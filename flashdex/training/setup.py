@@ -9,7 +9,9 @@ import json
 import logging
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +20,7 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.physics.make import engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.errors import DemoError, FlashdexError, LibraryError
@@ -28,6 +31,7 @@ from flashdex.motions.prepare import Order, hash_inputs, run_order
 from flashdex.motions.process import MotionSettings
 from flashdex.motions.recording import SourceOptions
 from flashdex.recipe import Recipe
+from flashdex.training.attempts import AttemptMaker, versions
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner
 from flashdex.training.ppo_learner import PPOLearner
@@ -84,6 +88,39 @@ class Workbench:
             evaluation=evaluation,
         )
 
+    @cached_property
+    def cpu_bank(self) -> ReferenceBank:
+        """The library as tensors on the cpu, where rollouts are built."""
+        on_cpu = self.bank.table.device.type == "cpu"
+        return self.bank if on_cpu else ReferenceBank(self.library, self.hands)
+
+    def attempt_maker(
+        self,
+        scenes: list[Scene],
+        *,
+        made_by: dict[str, Any] | None = None,
+        provenance: dict[str, str] | None = None,
+    ) -> AttemptMaker:
+        """Build what turns episodes into rollouts.
+
+        Args:
+            scenes: of all motions.
+            made_by: engine, versions and hardware of the states; this machine's, when
+                None.
+            provenance: stored with every rollout.
+        """
+        recipe, device = self.recipe, self.bank.table.device
+        return AttemptMaker(
+            self.cpu_bank,
+            self.hands,
+            scenes,
+            decimation=recipe.physics.decimation,
+            criterion=recipe.train.criterion,
+            seed=recipe.seed,
+            made_by=made_by or versions(recipe.physics.engine, device),
+            provenance=provenance,
+        )
+
     def _wrist_lead(self) -> Tensor:
         """Lag of the wrist servos, s, (2, J); zero for the fingers."""
         gains = self.recipe.physics.gains
@@ -115,11 +152,12 @@ class Workbench:
         )
 
 
-def open_workbench(recipe: Recipe) -> Workbench:
+def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Workbench:
     """Load or prepare the motions of a recipe and check that they fit it.
 
     Args:
         recipe: validated recipe.
+        device: of the bank; that of the physics when None.
 
     Raises:
         LibraryError: the library is missing, of another hand or of another rate.
@@ -139,7 +177,7 @@ def open_workbench(recipe: Recipe) -> Workbench:
             f"physics.decimation={round(1 / (library.fps * recipe.physics.timestep))} "
             f"or prepare with --hz {1 / step_dt:g}."
         )
-    bank = ReferenceBank(library, hands).to(engine_device(recipe.physics))
+    bank = ReferenceBank(library, hands).to(device or engine_device(recipe.physics))
     return Workbench(recipe, library, hands, bank)
 
 

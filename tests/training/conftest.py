@@ -59,7 +59,7 @@ def roll_tiny(library, hands, bank):
     bench = Workbench(recipe, library, hands, bank)
 
     def roll(controller):
-        return roll_all(bench, controller, criterion="sr_mt_obj")
+        return roll_all(bench, controller)
 
     return roll
 

@@ -11,7 +11,8 @@ from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
 from flashdex.metrics.resimulation import load_scene, resimulate
 from flashdex.metrics.rollout import Rollout
-from flashdex.training.attempts import AttemptRecorder
+from flashdex.training.attempt_ring import AttemptRing
+from flashdex.training.attempts import AttemptMaker
 
 
 def shaky(scale, seed=0):
@@ -94,10 +95,19 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
         finger_mode="residual",
         assist=AssistConfig(enabled=True),
     )
-    recorder = AttemptRecorder(env, criterion="sr_mt_obj", seed=0)
+    ring = AttemptRing(env)
+    maker = AttemptMaker(
+        env.bank,
+        env.hands,
+        env.physics.scenes,
+        decimation=env.physics.decimation,
+        criterion="sr_mt_obj",
+        seed=0,
+        made_by={},
+    )
     env.forced_motion = torch.tensor([2, 1, 0, 2, 1, 0])
     td, act, found = env.reset(), shaky(0.3), []
-    recorder.begin()
+    ring.begin()
     for step in range(110):
         if step % 20 == 0:
             env.forced_motion = (env.forced_motion + 1) % 3
@@ -105,10 +115,10 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
         for i, side in enumerate(keys.SIDES):
             td.set(keys.action(side), action[:, i])
         td = env.step(td)
-        found += recorder.step(action, td["next"], step)
         done = td["next", keys.DONE]
+        found += [maker.make(e) for e in ring.step(action, done, step)]
         td = env.maybe_reset(td["next"].clone())
-        recorder.begin()
+        ring.begin()
     assert len(found) > 5
     motions = {a.rollout.motion for a in found}
     assert "both" in motions

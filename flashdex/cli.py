@@ -84,7 +84,11 @@ def make_parser() -> argparse.ArgumentParser:
         verb.set_defaults(run=run)
         return verb
 
-    add("doctor", _doctor, "say what this computer has and what is missing")
+    verb = add("doctor", _doctor, "say what this computer has and what is missing")
+    verb.add_argument(
+        "recipe", nargs="?", help="say what memory this recipe needs instead"
+    )
+    verb.add_argument("overrides", nargs="*", metavar="key=value")
     add("ls", _ls, "list recipes with what they promise, and sources of recordings")
     _add_recipe_verbs(add)
     add_data_verbs(add)
@@ -135,15 +139,21 @@ def _add_run_verbs(
     verb.add_argument("run_dir", type=Path, metavar="RUN")
 
     verb = add("bench", _bench, "measure; prints JSON")
-    verb.add_argument("what", choices=["env", "learner"], help="what to measure")
+    verb.add_argument(
+        "what", choices=["env", "replay", "learner", "train"], help="what to measure"
+    )
     verb.add_argument(
         "words", nargs=argparse.REMAINDER, help="options of it; try: bench env --help"
     )
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from flashdex.doctor import examine, format_report
+    from flashdex.doctor import examine, examine_recipe, format_report
 
+    if args.recipe is not None:
+        report, fits = examine_recipe(args.recipe, args.overrides)
+        print(report)
+        return int(not fits)
     findings = examine()
     print(format_report(findings))
     return int(any(finding.status == "missing" for finding in findings))
@@ -266,9 +276,9 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    from flashdex.bench import env, learner
+    from importlib import import_module
 
-    {"env": env.main, "learner": learner.main}[args.what](args.words)
+    import_module(f"flashdex.bench.{args.what}").main(args.words)
     return 0
 
 

@@ -65,6 +65,35 @@ def format_report(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
+def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
+    """Say what memory a recipe needs here and on other cards.
+
+    Args:
+        name: name or path of a recipe.
+        overrides: ``key=value`` changes of it.
+
+    Returns:
+        The report, and whether the recipe fits this machine.
+
+    Raises:
+        FlashdexError: the recipe has mistakes or trains no motions.
+    """
+    from flashdex.recipe import Recipe, compose, expect_kind
+    from flashdex.training.memory import plan_memory
+    from flashdex.training.memory_text import format_cards, format_plan, format_work
+    from flashdex.training.run import default_run_dir
+
+    recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")
+    on_gpu = recipe.physics.engine != "cpu"
+    plan = plan_memory(
+        recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
+    )
+    parts = [format_plan(plan)]
+    if recipe.algo.kind == "flashsac":
+        parts += [format_cards(plan)] * on_gpu + [format_work(plan)]
+    return "\n\n".join(parts), plan.fits and not (on_gpu and plan.machine.gpu is None)
+
+
 def _python() -> Finding:
     version = platform.python_version()
     status: Status = "ok" if sys.version_info >= (3, 11) else "missing"

@@ -157,9 +157,9 @@ class Trainer:
             self._remember(td, action)
         if not self.learner.is_off_policy:
             self._learn()
-        outcome = self.env.last_outcome
-        self.stats.add_step(outcome, done, terminated)
-        self.assist_epoch.step(self.env, outcome, done, terminated, self._vector_steps)
+        judged = (self.env.last_outcome, done, terminated)
+        self.stats.add_step(*judged)
+        self.assist_epoch.step(self.env, *judged, self._vector_steps)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
@@ -212,10 +212,9 @@ class Trainer:
         return ""
 
     def _write_log(self) -> None:
-        counters = (self.env_steps, self.ledger.num_attempts)
+        counters, now = (self.env_steps, self.ledger.num_attempts), time.monotonic()
         if counters == self._logged:
             return  # a clean stop has just logged, or a resume has nothing left to do
-        now = time.monotonic()
         seconds = max(now - self._last_log, 1e-9)
         record = make_record(
             env_steps=self.env_steps,

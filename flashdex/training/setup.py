@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import fnmatch
-import hashlib
-import json
 import logging
 import math
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,15 +17,13 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
-from flashdex.errors import DemoError, FlashdexError, LibraryError
+from flashdex.errors import FlashdexError, LibraryError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.prepare import Order, hash_inputs, run_order
-from flashdex.motions.process import MotionSettings
-from flashdex.motions.recording import SourceOptions
 from flashdex.recipe import Recipe
 from flashdex.training.attempts import AttemptMaker, versions
+from flashdex.training.collection import load_library, select_motions
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner
 from flashdex.training.ppo_learner import PPOLearner
@@ -88,11 +80,11 @@ class Workbench:
             evaluation=evaluation,
         )
 
-    @cached_property
-    def cpu_bank(self) -> ReferenceBank:
-        """The library as tensors on the cpu, where rollouts are built."""
-        on_cpu = self.bank.table.device.type == "cpu"
-        return self.bank if on_cpu else ReferenceBank(self.library, self.hands)
+    def bank_on(self, device: torch.device) -> ReferenceBank:
+        """The library as tensors on another device; ``bank`` itself on its own."""
+        if device == self.bank.table.device:
+            return self.bank
+        return ReferenceBank(self.library, self.hands).to(device)
 
     def attempt_maker(
         self,
@@ -111,7 +103,7 @@ class Workbench:
         """
         recipe, device = self.recipe, self.bank.table.device
         return AttemptMaker(
-            self.cpu_bank,
+            self.bank_on(torch.device("cpu")),
             self.hands,
             scenes,
             decimation=recipe.physics.decimation,
@@ -130,26 +122,58 @@ class Workbench:
         return lead
 
     def make_learner(self, env: TrackingEnv) -> Learner:
-        """Build networks, loss and replay for an environment's states."""
-        recipe = self.recipe
+        """Build networks, loss and replay for an environment's states.
+
+        Raises:
+            FlashdexError: the recipe asks for a device that is not there.
+        """
+        recipe, device = self.recipe, learner_device(self.recipe)
+        if device.type == "cuda":
+            torch.set_float32_matmul_precision(
+                "high" if recipe.algo.tf32 else "highest"
+            )
+        bank = self.bank_on(device)
         transforms = make_transforms(
             recipe.env.transforms,
-            self.bank,
+            bank,
             self.hands,
             reference_offset=recipe.env.reference_offset,
         )
-        algo, example = recipe.algo, env.reset()
+        algo, example = recipe.algo, env.reset().to(device)
         if algo.kind == "ppo":
-            return PPOLearner(algo, transforms, self.bank, example, seed=recipe.seed)
+            return PPOLearner(
+                algo, transforms, bank, example, seed=recipe.seed, device=device
+            )
         steps = recipe.total_env_steps / env.num_envs
         return FlashSACLearner(
             algo,
             transforms,
-            self.bank,
+            bank,
             example,
             total_updates=max(1, math.ceil(steps * algo.updates_per_step)),
             seed=recipe.seed,
+            device=device,
         )
+
+
+def learner_device(recipe: Recipe) -> torch.device:
+    """Where a recipe learns.
+
+    Args:
+        recipe: ``algo.device`` names it; auto is a GPU where there is one.
+
+    Raises:
+        FlashdexError: it asks for a GPU, and torch sees none.
+    """
+    wanted, there = recipe.algo.device, torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise FlashdexError(
+            "algo.device: 'cuda' is not there: torch sees no GPU ('flashdex doctor' "
+            "says why). Use algo.device=cpu or auto."
+        )
+    if wanted == "cpu" or not there:
+        return torch.device("cpu")
+    return torch.device("cuda", torch.cuda.current_device())
 
 
 def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Workbench:
@@ -163,7 +187,7 @@ def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Wor
         LibraryError: the library is missing, of another hand or of another rate.
     """
     hands = load_hand(recipe.hand)
-    library = select_motions(_load_library(recipe), recipe)
+    library = select_motions(load_library(recipe), recipe)
     if library.hand != recipe.hand:
         raise LibraryError(
             f"{library.path}: prepared for hand '{library.hand}', the recipe asks for "
@@ -179,105 +203,3 @@ def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Wor
         )
     bank = ReferenceBank(library, hands).to(device or engine_device(recipe.physics))
     return Workbench(recipe, library, hands, bank)
-
-
-def _load_library(recipe: Recipe) -> MotionLibrary:
-    motions = recipe.motions
-    if motions.library is not None:
-        return MotionLibrary.load(motions.library)
-    if motions.source is None:
-        raise FlashdexError(
-            "motions: neither 'library' nor 'source' is set. Give motions.library=DIR "
-            "of a prepared library, or motions.source=procedural."
-        )
-    folder = Path("libraries") / _library_name(recipe)
-    order = _order(recipe)
-    if (folder / "manifest.json").is_file():
-        library = MotionLibrary.load(folder)
-        try:
-            if library.manifest.get("inputs") == hash_inputs(order):
-                return library
-        except DemoError as error:
-            _LOG.info("%s is used as it is; its recordings: %s", folder, error)
-            return library
-        _LOG.info("the recordings have changed since %s was prepared", folder)
-    _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
-    return run_order(order, folder)
-
-
-def _order(recipe: Recipe) -> Order:
-    motions = recipe.motions
-    assert motions.source is not None
-    # made-up motions are made by number; of recorded ones, the selection is counted
-    counted = motions.source == "procedural" or motions.select is None
-    options = SourceOptions(
-        path=None if motions.input is None else Path(motions.input),
-        mano=None if motions.mano is None else Path(motions.mano),
-        models=None if motions.models is None else Path(motions.models),
-        seed=motions.seed,
-        limit=motions.count if counted else None,
-    )
-    settings = MotionSettings(
-        hand=recipe.hand, control_hz=motions.control_hz, speed=motions.speed
-    )
-    return Order(motions.source, options, settings)
-
-
-def _library_name(recipe: Recipe) -> str:
-    """Folder of an automatically prepared library: readable, and unique by content."""
-    motions = dataclasses.asdict(recipe.motions)
-    for key in ("library", "select"):
-        motions.pop(key)
-    text = json.dumps({**motions, "hand": recipe.hand}, sort_keys=True)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return f"{recipe.motions.source}-{recipe.hand}-{digest}"
-
-
-def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
-    """Keep the motions named by ``motions.select`` and ``motions.count``.
-
-    Their frames are copied into memory, one motion after the other.
-    """
-    chosen = list(range(library.num_motions))
-    if recipe.motions.select is not None:
-        chosen = []
-        for pattern in recipe.motions.select:
-            rows = [
-                i
-                for i, name in enumerate(library.names)
-                if fnmatch.fnmatch(name, pattern)
-            ]
-            if not rows:
-                raise LibraryError(
-                    f"{library.path}: motions.select '{pattern}' matches none of "
-                    f"{', '.join(library.names)}."
-                )
-            chosen += [r for r in rows if r not in chosen]
-    if recipe.motions.count is not None:
-        chosen = chosen[: recipe.motions.count]
-    if len(chosen) == library.num_motions:
-        return library
-    return _take(library, chosen)
-
-
-def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
-    index = [
-        torch.arange(int(s), int(s) + int(n))
-        for s, n in zip(
-            library.motions["start"][rows].tolist(),
-            library.motions["length"][rows].tolist(),
-            strict=True,
-        )
-    ]
-    motions = library.motions[torch.tensor(rows)].clone()
-    length = motions["length"]
-    motions["start"] = torch.cumsum(length, 0) - length
-    manifest = dict(library.manifest)
-    manifest["motions"] = [library.manifest["motions"][r] for r in rows]
-    return MotionLibrary(
-        path=library.path,
-        frames=library.frames[torch.cat(index)],
-        motions=motions,
-        objects=library.objects,
-        manifest=manifest,
-    )

@@ -1,0 +1,113 @@
+"""What memory this machine has left: GPU, host, container, disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+Pool = Literal["gpu", "host", "disk"]
+_MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Free bytes of each pool; None where it does not exist or nobody tells.
+
+    Attributes:
+        gpu: free memory of the current CUDA device.
+        host: what processes can still take, the container's limit included.
+        disk: free where the run directory is or will be.
+        gpu_name: of the device.
+    """
+
+    gpu: int | None
+    host: int | None
+    disk: int | None
+    gpu_name: str = ""
+
+    def free(self, pool: Pool) -> int | None:
+        """Free bytes of one pool."""
+        return {"gpu": self.gpu, "host": self.host, "disk": self.disk}[pool]
+
+
+def look_at_machine(run_dir: Path) -> Machine:
+    """Ask the device, the kernel and the file system.
+
+    Args:
+        run_dir: run directory; it need not exist.
+    """
+    gpu, name = None, ""
+    if torch.cuda.is_available():
+        gpu, _ = torch.cuda.mem_get_info()
+        name = torch.cuda.get_device_name()
+    return Machine(gpu, free_host(), _free_disk(run_dir), name)
+
+
+def free_host(meminfo: Path = _MEMINFO, cgroup: Path | None = None) -> int | None:
+    """Bytes of host memory that can still be taken.
+
+    Args:
+        meminfo: the kernel's table; its MemAvailable counts caches as free.
+        cgroup: folder of this process's version 2 control group; None finds it. Each
+            group above it may have a limit, too.
+
+    Returns:
+        The smallest of what the machine has and what each container limit leaves; the
+        installed memory where there is no table, None where that is unknown, too.
+    """
+    found = [_available(meminfo)]
+    folder = _own_cgroup() if cgroup is None else cgroup
+    for group in (folder, *folder.parents):
+        if not (group / "cgroup.controllers").is_file():
+            break
+        found.append(_left_in(group))
+    known = [size for size in found if size is not None]
+    return min(known) if known else None
+
+
+def _available(meminfo: Path) -> int | None:
+    try:
+        lines = meminfo.read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return None
+
+
+def _own_cgroup() -> Path:
+    try:
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return _CGROUP
+    own = next((line[3:] for line in lines if line.startswith("0::")), "/")
+    folder = _CGROUP / own.lstrip("/")
+    # inside a container the path may be the host's, which is not mounted here
+    return folder if folder.is_dir() else _CGROUP
+
+
+def _left_in(group: Path) -> int | None:
+    """Limit less use, in which file caches do not count; None without a limit."""
+    try:
+        limit = int((group / "memory.max").read_text())  # or the word "max"
+        used = int((group / "memory.current").read_text())
+        stat = (group / "memory.stat").read_text().split()
+    except (OSError, ValueError):
+        return None
+    table = dict(zip(stat[::2], stat[1::2], strict=False))
+    cached = int(table.get("inactive_file", 0)) + int(table.get("active_file", 0))
+    return max(0, limit - used + min(cached, used))
+
+
+def _free_disk(folder: Path) -> int | None:
+    folder = folder.absolute()
+    there = next((p for p in (folder, *folder.parents) if p.exists()), None)
+    return None if there is None else shutil.disk_usage(there).free

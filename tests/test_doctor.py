@@ -1,0 +1,84 @@
+"""`flashdex doctor RECIPE`: memory of a recipe, in the terminal and on the page."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from flashdex import doctor
+from flashdex.cli import main
+from flashdex.training import memory
+from flashdex.training.memory_machine import Machine
+
+PAGE = Path(__file__).parent.parent / "docs" / "memory.md"
+GB = 10**9
+
+
+@pytest.fixture
+def give(monkeypatch):
+    """Pretend that this machine has so many free bytes."""
+
+    def set_free(*, gpu=None, host=100 * GB, disk=100 * GB):
+        found = Machine(gpu, host, disk)
+        monkeypatch.setattr(memory, "look_at_machine", lambda _: found)
+
+    return set_free
+
+
+def test_a_recipe_that_fits(give, capsys):
+    give()
+    assert main(["doctor", "quickstart"]) == 0
+    out = capsys.readouterr().out
+    assert "host memory:" in out
+    assert "It fits." in out
+    assert "GFLOP" in out
+    assert "by card" not in out  # this learner is on the host
+
+
+def test_a_recipe_that_does_not(give, capsys):
+    give(host=30 * GB)
+    assert main(["doctor", "quickstart", "algo.buffer_size=40_000_000"]) == 1
+    out = capsys.readouterr().out
+    assert "It does not fit: host memory " in out
+    offered = re.findall(r"^  (algo\.buffer_size=\d+)$", out, re.MULTILINE)
+    assert len(offered) == 1
+    assert main(["doctor", "quickstart", *offered]) == 0
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["gym_halfcheetah"], "needs a recipe with task: retarget"),
+        (["quickstrat"], "Did you mean 'quickstart'?"),
+        (["quickstart", "algo.bufer_size=3"], "Did you mean 'buffer_size'?"),
+    ],
+)
+def test_mistakes_exit_two(argv, expected, capsys):
+    assert main(["doctor", *argv]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_ppo_has_a_rollout_and_no_rows(give):
+    give()
+    report, fits = doctor.examine_recipe("quickstart", ["algo=ppo"])
+    assert fits
+    assert "rollout" in report
+    assert "replay rows" not in report
+
+
+def test_the_page_shows_what_is_printed(give):
+    pytest.importorskip("mujoco_warp")
+    give()
+    report, fits = doctor.examine_recipe(
+        "bench50_xhand", ["motions.library=/nowhere/bench50"]
+    )
+    assert not fits  # no GPU
+    page = PAGE.read_text()
+    # what other parts of the house decide is left out: physics, and sums with it
+    names = ("replay rows", "update", "networks", "observations", "checkpoints")
+    lines = [s for s in report.splitlines() if s.strip().startswith(names)]
+    assert len(lines) == len(names)
+    for line in [*lines, next(s for s in report.splitlines() if "GFLOP" in s)]:
+        assert line in page

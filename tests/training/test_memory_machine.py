@@ -1,0 +1,68 @@
+"""What is free: the kernel's table, limits of containers, the disk."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from flashdex.training.memory_machine import free_host, look_at_machine
+
+GB = 10**9
+
+
+@pytest.fixture
+def meminfo(tmp_path):
+    file = tmp_path / "meminfo"
+    file.write_text(
+        "MemTotal:  64000000 kB\nMemFree: 1 kB\nMemAvailable: 50000000 kB\n"
+    )
+    return file
+
+
+def write_group(folder, limit, used, cached):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cgroup.controllers").write_text("memory\n")
+    (folder / "memory.max").write_text(f"{limit}\n")
+    (folder / "memory.current").write_text(f"{used}\n")
+    (folder / "memory.stat").write_text(f"anon 5\ninactive_file {cached}\nslab 3\n")
+
+
+def test_without_a_limit_the_kernel_is_right(meminfo, tmp_path):
+    assert free_host(meminfo, tmp_path / "none") == 50_000_000 * 1024
+    write_group(tmp_path / "group", "max", GB, 0)
+    assert free_host(meminfo, tmp_path / "group") == 50_000_000 * 1024
+
+
+def test_a_container_may_have_less(meminfo, tmp_path):
+    write_group(tmp_path / "group", 16 * GB, 10 * GB, 3 * GB)
+    assert free_host(meminfo, tmp_path / "group") == 9 * GB
+
+
+def test_a_group_above_may_be_smaller(meminfo, tmp_path):
+    write_group(tmp_path / "outer", 8 * GB, 7 * GB, 0)
+    write_group(tmp_path / "outer" / "inner", 16 * GB, GB, 0)
+    assert free_host(meminfo, tmp_path / "outer" / "inner") == GB
+
+
+def test_a_full_container_has_nothing(meminfo, tmp_path):
+    write_group(tmp_path / "group", GB, 2 * GB, 0)
+    assert free_host(meminfo, tmp_path / "group") == 0
+
+
+def test_unreadable_limits_count_as_none(meminfo, tmp_path):
+    write_group(tmp_path / "group", "what", 0, 0)
+    assert free_host(meminfo, tmp_path / "group") == 50_000_000 * 1024
+
+
+def test_without_a_table_the_installed_memory_counts(tmp_path):
+    found = free_host(tmp_path / "none", tmp_path)
+    assert found is not None
+    assert found > 0
+
+
+def test_a_run_directory_need_not_exist(tmp_path):
+    machine = look_at_machine(tmp_path / "runs" / "not" / "yet")
+    assert machine.disk == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.05)
+    assert machine.host is not None
+    assert machine.free("host") == machine.host

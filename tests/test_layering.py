@@ -34,12 +34,19 @@ NEVER = {
     "viz": {"training", "cli"},
     "envs": {"modules", "objectives", "training", "cli"},
 }
+# Files of the warp engine; kernels need warp at the top, so they are imported lazily.
+WARP = {f"envs/physics/{path.name}" for path in PACKAGE.glob("envs/physics/warp*.py")}
+WARP_KERNELS = "envs/physics/warp_kernels.py"
+# Files of the brax engine; only its front imports the others, lazily, so they need not.
+BRAX = {f"envs/physics/{path.name}" for path in PACKAGE.glob("envs/physics/brax*.py")}
+BRAX_INSIDE = BRAX - {"envs/physics/brax.py"}
 # Optional packages and the only files that may import them, inside a function.
 OPTIONAL = {
-    "mujoco_warp": {"envs/physics/warp.py"},
-    "warp": {"envs/physics/warp.py"},
-    "brax": {"envs/physics/brax.py"},
-    "jax": {"envs/physics/brax.py"},
+    "mujoco_warp": WARP,
+    "warp": WARP,
+    "brax": BRAX,
+    "jax": BRAX,
+    "mujoco.mjx": BRAX,
     "wandb": {"training/logging.py"},
     "viser": {"viz/viewer.py", "viz/page.py"},
     "mjviser": {"viz/viewer.py", "viz/page.py"},
@@ -54,7 +61,7 @@ TENSOR_PACKAGES = {"__future__", "torch", "tensordict", "math"} | {
     "typing",
 }
 TENSOR_PARTS = ("flashdex.geometry", "flashdex.keys", "flashdex.envs", "flashdex.hands")
-PURE = ["envs/rewards.py", "envs/features.py", "envs/terminations.py", "envs/assist.py"]
+PURE = ["envs/rewards.py", "envs/features.py", "envs/terminations.py", "envs/wrench.py"]
 
 
 def imports_of(tree):
@@ -76,9 +83,9 @@ def imports_of(tree):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "absolute imports only"
             yield node.module, id(node) in top
-            if node.module == "flashdex":
+            if node.module in ("flashdex", "mujoco"):
                 for alias in node.names:
-                    yield f"flashdex.{alias.name}", id(node) in top
+                    yield f"{node.module}.{alias.name}", id(node) in top
 
 
 def part_of(path):
@@ -107,10 +114,18 @@ def test_parts_import_only_what_lies_below(path):
 @pytest.mark.parametrize("path", FILES, ids=ids)
 def test_optional_packages_are_imported_lazily_in_their_file(path):
     for name, is_top in imports_of(ast.parse(path.read_text())):
-        package = name.split(".")[0]
+        is_mjx = name.startswith("mujoco.mjx")
+        package = "mujoco.mjx" if is_mjx else name.split(".")[0]
         if package in OPTIONAL:
             assert ids(path) in OPTIONAL[package], f"{package} does not belong here"
-            assert not is_top, f"{package} must be imported inside a function"
+            if ids(path) not in {WARP_KERNELS, *BRAX_INSIDE}:
+                assert not is_top, f"{package} must be imported inside a function"
+        if name == "flashdex.envs.physics.warp_kernels":
+            assert ids(path) in WARP
+            assert not is_top, "kernels must be imported inside a function"
+        if name.startswith("flashdex.envs.physics.brax_"):
+            assert ids(path) in BRAX
+            assert ids(path) in BRAX_INSIDE or not is_top
 
 
 @pytest.mark.parametrize("name", PURE)

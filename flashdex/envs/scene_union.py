@@ -186,7 +186,10 @@ def _contact(
         return out
     for i, side in enumerate(layout.sides):
         start = [
-            [union.sensor(f"contact_{n}_object{s}").adr[0] for n in hands[side].link_names]
+            [
+                union.sensor(f"contact_{n}_object{s}").adr[0]
+                for n in hands[side].link_names
+            ]
             for s in range(layout.num_objects)
         ]
         slots = own[:, keys.SIDES.index(side)]

@@ -72,7 +72,8 @@ class PhysicsConfig:
     """The physics engine and its numbers."""
 
     engine: Literal["cpu", "warp", "brax"] = "cpu"
-    """cpu = mujoco.batch threads. warp and brax are refused in this version."""
+    """cpu = MuJoCo C on all cores; warp = all worlds on one NVIDIA GPU; brax = MJX on
+    JAX, for collections whose motions all use the same objects."""
     decimation: int = number(4, low=1)
     """Physics substeps a control step; fewer is faster and less stable."""
     timestep: float = number(1 / 240, above=0)
@@ -102,6 +103,12 @@ class PhysicsConfig:
     """Line-search iterations."""
     num_threads: int = number(0, low=0)
     """Threads of the cpu engine; 0 = all cores."""
+    nconmax: int | None = number(None, low=1)
+    """Contacts a world, warp only; null = four for each geom that moves. All worlds
+    share the room."""
+    njmax: int | None = number(None, low=1)
+    """Constraint rows a world, warp only; null = those of so many contacts and of all
+    joint limits."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,192 @@
+"""mujoco_warp: all worlds on one GPU, each with the objects of its own motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from flashdex import keys
+from flashdex.envs.physics.base import RawState
+from flashdex.envs.physics.state_map import StateMap
+from flashdex.envs.physics.warp_graph import Recorded
+from flashdex.envs.physics.warp_model import (
+    WorldRows,
+    model_fields,
+    require_warp,
+    room_of,
+)
+from flashdex.envs.physics.warp_wrench import WrenchInput
+from flashdex.envs.scene import Scene, build_scenes
+from flashdex.envs.scene_union import build_union
+from flashdex.envs.wrench import ObjectWrench
+from flashdex.hands.spec import HandSpec
+from flashdex.motions.library import MotionLibrary
+
+if TYPE_CHECKING:
+    from flashdex.recipe import PhysicsConfig
+
+
+def _device() -> torch.device:
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", torch.cuda.current_device())
+
+
+def _kinds(overflow: Any) -> dict[str, int]:
+    """Bits of warp's overflow flags by what ran out; iteration limits are no room."""
+    return {
+        "contacts": overflow.BROADPHASE | overflow.NARROWPHASE | overflow.CCD,
+        "contact shapes": overflow.EPA_HORIZON,
+        "constraints": overflow.NEFC | overflow.NJMAX_NNZ,
+        "contact sensors": overflow.CONTACT_MATCH,
+    }
+
+
+class WarpPhysics:
+    """One model of mujoco_warp whose rows follow each world's motion; see ``Physics``.
+
+    It computes in float32 and runs on the first CUDA device, without one on the CPU.
+
+    Args:
+        library: the prepared collection; one scene is compiled for each motion.
+        hands: hand specs by side.
+        physics: engine settings of the recipe.
+        num_envs: worlds N.
+
+    Raises:
+        FlashdexError: its packages are missing, or it cannot run this collection.
+    """
+
+    def __init__(
+        self,
+        library: MotionLibrary,
+        hands: dict[keys.Side, HandSpec],
+        physics: PhysicsConfig,
+        num_envs: int,
+    ) -> None:
+        wp = require_warp()[0]
+        self.num_envs = num_envs
+        self.device = _device()
+        self.decimation = physics.decimation
+        self.step_dt = physics.timestep * physics.decimation
+        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        union = build_union(library, hands, physics, self.scenes, model_fields())
+        room = room_of(union.model, physics)
+        name = str(wp.device_from_torch(self.device))
+        self._rows = WorldRows(union, num_envs, room, name)
+        self.model, self.data = self._rows.model, self._rows.data
+        self.map = StateMap(library, hands, self.scenes[0]).to(self.device)
+        self._contact_adr = torch.as_tensor(union.contact).to(self.device)
+        data = self.data
+        self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self._ctrl, self._xfrc = wp.to_torch(data.ctrl), wp.to_torch(data.xfrc_applied)
+        self._sensor = wp.to_torch(data.sensordata)
+        self._warmstart = wp.to_torch(data.qacc_warmstart)
+        self._overflow = wp.to_torch(data.overflow)
+        self._motion = torch.zeros(num_envs, dtype=torch.long, device=self.device)
+        self._bad = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        self._wrench = WrenchInput(self.data, union.model, self.map, num_envs)
+        self._bad_wp = wp.from_torch(self._bad)
+        self._step_free = Recorded(self._launch_free, self.device)
+        self._step_pulled = Recorded(self._launch_pulled, self.device)
+        self._forward = Recorded(self._launch_forward, self.device)
+        self._rows.write(torch.ones_like(self._bad), self._motion)
+
+    def reset(
+        self,
+        mask: Tensor,
+        motion: Tensor,
+        joint_pos: Tensor,
+        joint_vel: Tensor,
+        object_pose: Tensor,
+        object_vel: Tensor,
+    ) -> None:
+        """Put worlds into given states; see ``Physics.reset``."""
+        self._motion.copy_(torch.where(mask, motion, self._motion))
+        self._rows.write(mask, self._motion)
+        state = self.map.write(
+            self._motion, joint_pos, joint_vel, object_pose, object_vel
+        )
+        chosen = mask.unsqueeze(-1)
+        views = (self._qpos, self._qvel, self._ctrl)
+        for view, value in zip(views, state, strict=True):
+            view.copy_(torch.where(chosen, value.float(), view))
+        for view in (self._warmstart, self._xfrc, self._wrench.applied):
+            held = mask.reshape(-1, *[1] * (view.ndim - 1))
+            view.copy_(torch.where(held, 0.0, view))
+        # Of the other worlds this changes only what a step computes anew, and what
+        # the sensors said of their last substep.
+        sensed = self._sensor.clone()
+        self._forward()
+        self._sensor.copy_(torch.where(chosen, self._sensor, sensed))
+        self._bad &= ~mask
+
+    def step(self, target: Tensor, wrench: ObjectWrench | None = None) -> None:
+        """Advance one control step; see ``Physics.step``."""
+        self._ctrl.copy_(self.map.controls(self._motion, target))
+        if wrench is None:
+            self._xfrc.zero_()
+            self._wrench.applied.zero_()
+            self._step_free()
+        else:
+            self._wrench.copy(wrench)
+            self._step_pulled()
+
+    def state(self) -> TensorDict:
+        """Current state in the layout of ``flashdex.keys``; see ``Physics.state``."""
+        pos, vel, pose, object_vel = self.map.read(self._qpos, self._qvel, self._motion)
+        adr = self._contact_adr[self._motion]
+        sensed = self._sensor.gather(1, adr.flatten(1)).reshape(adr.shape)
+        out = {
+            keys.JOINT_POS: pos,
+            keys.JOINT_VEL: vel,
+            keys.OBJECT_POSE: pose,
+            keys.OBJECT_VEL: object_vel,
+            keys.CONTACT: self.map.read_contact(sensed, self._motion),
+            "bad": self._bad.clone(),
+        }
+        return TensorDict(out, batch_size=[self.num_envs], device=self.device)
+
+    def raw(self) -> RawState:
+        """Views of the state; see ``Physics.raw``."""
+        return RawState(self._qpos, self._qvel, self._ctrl, self._wrench.applied)
+
+    def take_overflow(self) -> dict[str, int]:
+        """Worlds whose room was too small since the last call; see the protocol."""
+        mjw = require_warp()[1]
+        found = self._overflow.clone()
+        self._overflow.zero_()
+        worlds = {
+            kind: int(((found & int(bits)) != 0).sum())
+            for kind, bits in _kinds(mjw.OverflowType).items()
+        }
+        return {kind: count for kind, count in worlds.items() if count}
+
+    def _launch_free(self) -> None:
+        for _ in range(self.decimation):
+            self._launch_substep()
+
+    def _launch_pulled(self) -> None:
+        for _ in range(self.decimation):
+            self._wrench.launch()
+            self._launch_substep()
+
+    def _launch_substep(self) -> None:
+        wp, mjw = require_warp()
+        from flashdex.envs.physics.warp_kernels import mark_bad
+
+        mjw.step(self.model, self.data)
+        arrays = [self.data.qpos, self.data.qvel, self.data.qacc]
+        wp.launch(
+            mark_bad,
+            dim=self.num_envs,
+            inputs=arrays,
+            outputs=[self._bad_wp],
+            device=self.data.qpos.device,
+        )
+
+    def _launch_forward(self) -> None:
+        require_warp()[1].forward(self.model, self.data)

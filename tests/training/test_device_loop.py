@@ -1,0 +1,129 @@
+"""The loop as it runs on a device: nothing waits for it, and nothing is lost."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from no_sync import forbid_sync
+from torchrl.envs.utils import step_mdp
+
+from flashdex import keys
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.recipe import AssistConfig
+from flashdex.training.attempt_ring import LOOK_EVERY, AttemptRing
+from flashdex.training.guard import GradientGuard
+from flashdex.training.judging import JudgeHere
+from flashdex.training.ledger import Ledger
+from flashdex.training.logging import MetricLog
+from flashdex.training.loop import Trainer
+from flashdex.training.sessions import Start
+
+
+def unseen(env: TrackingEnv) -> TrackingEnv:
+    """The environment, as if the host had to wait for what it looks at."""
+    env.host_sees = False
+    return env
+
+
+@pytest.fixture
+def make_trainer(make_bench, tmp_path):
+    def make(engine, **settings):
+        bench = make_bench(4, attempt_share=0.5, finger_mode="residual", **settings)
+        physics = dataclasses.replace(bench.recipe.physics, engine=engine)
+        recipe = dataclasses.replace(bench.recipe, physics=physics)
+        bench = dataclasses.replace(bench, recipe=recipe)
+        env = unseen(bench.make_env())
+        ledger = Ledger(
+            tmp_path, bench.bank.names, criterion="sr_mt_obj", seed=0, engine=engine
+        )
+        trainer = Trainer(
+            recipe,
+            tmp_path,
+            env,
+            bench.make_learner(env),
+            ledger,
+            JudgeHere(ledger, bench.attempt_maker(env.physics.scenes)),
+            MetricLog(tmp_path, recipe),
+            start=Start(env_steps=0, wall_s=0.0, lost=0),
+        )
+        trainer.guard = GradientGuard(waits=False)
+        return trainer
+
+    return make
+
+
+@pytest.mark.parametrize("kind", ["flashsac", "ppo"])
+def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer, kind):
+    algo = {"kind": kind, "min_buffer": 20, "updates_per_step": 2.0}
+    trainer = make_trainer("warp", algo=algo, assist=AssistConfig(enabled=True))
+    td = trainer.env.reset()
+    trainer.attempts.begin()
+    with trainer.guard:
+        for _ in range(LOOK_EVERY):
+            td = trainer.vector_step(td)
+        before = trainer.learner.updates
+        with forbid_sync():
+            for _ in range(LOOK_EVERY - 1):
+                td = trainer.vector_step(td)
+    if kind == "flashsac":
+        assert trainer.learner.updates == before + 2 * (LOOK_EVERY - 1)
+    trainer.alongside.close()
+    assert trainer.stats.pop(1.0, 4)["episode/ends"] > 0
+
+
+def random_steps(env, steps, *, seed=0):
+    """Yield (action, done) of random steps; restarts what has ended."""
+    generator = torch.Generator().manual_seed(seed)
+    td = env.reset()
+    yield None, None
+    for _ in range(steps):
+        action = 2 * torch.rand(env.num_envs, 2, 18, generator=generator) - 1
+        env.put_action(td, action)
+        td = env.step(td)
+        yield action, td["next", keys.DONE]
+        done = td["next", keys.DONE]
+        td = env.restart(done.squeeze(-1)) if done.any() else step_mdp(td)
+
+
+def test_looking_seldom_finds_the_same_episodes(make_env):
+    env = make_env(6, attempt_share=0.5)
+    often, seldom = AttemptRing(env, look_every=1), AttemptRing(env, look_every=7)
+    one, other = [], []
+    for number, (action, done) in enumerate(random_steps(env, 200)):
+        if action is None:
+            continue
+        # the state before the step is the one after the restart: begin comes first
+        one += often.step(action, done, number)
+        other += seldom.step(action, done, number)
+        for ring in (often, seldom):
+            ring.begin()
+    other += seldom.look()
+    assert len(one) == len(other) > 6
+    for a, b in zip(one, other, strict=True):
+        assert (a.env, a.env_steps, a.motion, a.frame) == (
+            b.env,
+            b.env_steps,
+            b.motion,
+            b.frame,
+        )
+        assert a.causes == b.causes
+        for name in a.steps:
+            np.testing.assert_array_equal(a.steps[name], b.steps[name])
+
+
+def test_restart_is_the_reset_of_the_marked_worlds(make_env):
+    one, two = make_env(5, seed=3), make_env(5, seed=3)
+    roots = [one.reset(), two.reset()]
+    for _ in range(4):
+        action = one.rand_action(roots[0].clone())
+        for i, env in enumerate((one, two)):
+            roots[i] = step_mdp(env.step(action.clone()))
+    mask = torch.tensor([True, False, True, False, False])
+    asked = roots[0].set("_reset", mask.unsqueeze(-1))
+    by_torchrl, ours = one.reset(asked), two.restart(mask)
+    for key in (*keys.STATE, keys.ATTEMPT, keys.DONE):
+        assert torch.equal(by_torchrl[key], ours[key]), key
+    assert (by_torchrl[keys.FRAME][mask] != roots[1][keys.FRAME][mask]).any()

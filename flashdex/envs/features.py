@@ -263,15 +263,15 @@ def future_window(
     """
     frames = vectors.shape[1]
     wrist = quat_to_matrix(kin["wrist_quat"])
-    linear, angular = own_vel.split(3, -1)
-    now = torch.stack([own_pos, linear, angular, kin["wrist_pos"]], -2)
+    now = torch.stack([own_pos, *own_vel.split(3, -1), kin["wrist_pos"]], -2)
     now = torch.cat([now, kin["tip_pos"]], -2)
     # (N, 2, K * 9, 3) @ (N, 2, 3, 3): a row vector times R_w is R_w^T v.
     delta = (vectors - now.unsqueeze(1)).transpose(1, 2).flatten(2, 3) @ wrist
     delta = delta.unflatten(2, (frames, 9))
     # Columns of R_cur^T R_w for object and wrist; the wrist's is the identity.
     turn = quat_to_matrix(quat_mul(quat_conj(own_quat), kin["wrist_quat"]))
-    columns = torch.stack([turn, torch.eye(3).to(turn).expand_as(turn)], 2)[..., :2]
+    eye = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
+    columns = torch.stack([turn, eye], 2)[..., :2]
     # R_ref^T R_w of every frame, transposed back to R_w^T R_ref, then times columns.
     turned = rotations.permute(0, 2, 3, 1, 4, 5).flatten(3, 4)
     turned = (turned @ wrist.unsqueeze(2)).unflatten(3, (frames, 3)).mT

@@ -43,7 +43,8 @@ def categorical_projection(
     position = position.clamp(0.0, float(last))
     lower = position.floor()
     upper_share = position - lower
-    index = lower.long()
+    # NaN as an index would end a device's context; the gradient shows it anyway
+    index = lower.long().clamp(0, last)
     target = torch.zeros_like(prob)
     target.scatter_add_(-1, index, prob * (1.0 - upper_share))
     target.scatter_add_(-1, (index + 1).clamp_max(last), prob * upper_share)

@@ -63,6 +63,15 @@ def _standardised(x: Tensor) -> Tensor:
     return centred / (centred.square().mean().sqrt() + 1e-8)
 
 
+class _ClipLoss(ClipPPOLoss):
+    """TorchRL's loss without its look at the entropy, which waits for the device."""
+
+    def _get_entropy(
+        self, dist: torch.distributions.Distribution, adv_shape: torch.Size
+    ) -> Tensor:
+        return dist.entropy().unsqueeze(-1)
+
+
 class PPO:
     """Owns policy, value and optimiser, and learns from whole rollouts.
 
@@ -71,7 +80,7 @@ class PPO:
     of the rows that count, and under ``next`` ``reward``, ``done``, ``terminated`` (1).
 
     Args:
-        policy: Gaussian policy.
+        policy: Gaussian policy, on the device of everything else.
         value: state value.
         gamma: discount.
         gae_lambda: decay of the advantage estimate.
@@ -122,20 +131,26 @@ class PPO:
         self.parameters = [*policy.parameters(), *value.parameters()]
         # As a tensor the rate is steered without waiting for the device.
         self.optimizer = torch.optim.Adam(
-            self.parameters, lr=torch.tensor(lr), fused=True
+            self.parameters,
+            lr=torch.tensor(lr, device=policy.log_std.device),
+            fused=True,
         )
 
-    def _make_loss(self, **options: Any) -> ClipPPOLoss:
+    def _make_loss(self, **options: Any) -> _ClipLoss:
         actor = ProbabilisticActor(
             TensorDictModule(self.policy, self.in_keys, ["loc", "scale"]),
             in_keys=["loc", "scale"],
             distribution_class=IndependentNormal,
         )
         critic = TensorDictModule(self.value, self.in_keys, ["state_value"])
-        loss = ClipPPOLoss(
+        loss = _ClipLoss(
             actor, critic, loss_critic_type="l2", functional=False, **options
         )
         loss.set_keys(action="action", sample_log_prob="log_prob")
+        if options["clip_value"] is not None:
+            # as a buffer it would be read on the host at every step
+            del loss.clip_value
+            loss.clip_value = options["clip_value"]
         return loss
 
     def _inputs(self, td: TensorDictBase) -> list[Tensor]:
@@ -182,10 +197,13 @@ class PPO:
         rollout = self.estimate(rollout, tail)
         rows = cast(TensorDict, rollout[rollout["mask"].squeeze(-1)])
         rows.set("advantage", _standardised(rows.get("advantage")))
-        sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
+        zero = torch.zeros((), device=self.rate.device)
+        sums: dict[str, Tensor] = defaultdict(lambda: zero)
         steps = 0
         for _ in range(self.epochs if len(rows) else 0):
-            order = torch.randperm(len(rows), generator=self.generator)
+            order = torch.randperm(
+                len(rows), generator=self.generator, device=zero.device
+            )
             for chosen in order.chunk(self.minibatches):
                 for name, metric in self._step(rows[chosen], steps == 0).items():
                     sums[name] = sums[name] + metric.detach().mean()

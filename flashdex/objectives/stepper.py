@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from flashdex.modules.generator import restore_generator
 from flashdex.modules.layers import project_
 from flashdex.modules.product import bfloat16_products
 from flashdex.objectives.batch import FlashBatch, nested
@@ -79,6 +80,7 @@ class FlashSACStepper:
             self._actor_objective = torch.compile(loss.actor_objective)
             self._qvalue_objective = torch.compile(loss.qvalue_objective)
         zeros = torch.zeros(len(loss.groups), device=loss.log_alpha.device)
+        self._zero = zeros[0]
         self._actor_metrics: Metrics = dict.fromkeys(ACTOR_METRICS, zeros)
 
     def update(
@@ -144,7 +146,7 @@ class FlashSACStepper:
         for name, values in {**self._actor_metrics, **critic_metrics}.items():
             for group, value in zip(self.loss.groups, values.unbind(0), strict=True):
                 report.set(nested(group, name), value)
-        return report.set("learning_rate", torch.tensor(rate))
+        return report.set("learning_rate", torch.full_like(self._zero, rate))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact resume needs, the environments excepted."""
@@ -167,6 +169,7 @@ class FlashSACStepper:
         self.alpha_optimizer.load_state_dict(state["alpha_optimizer"])
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.updates = state["updates"]
-        self._actor_metrics = dict(state["actor_metrics"])
+        metrics = state["actor_metrics"].items()
+        self._actor_metrics = {k: v.to(self._zero.device) for k, v in metrics}
         if self.generator is not None and "generator" in state:
-            self.generator.set_state(state["generator"])
+            restore_generator(self.generator, state["generator"])

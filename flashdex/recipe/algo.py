@@ -54,6 +54,17 @@ class AlgoConfig:
     """Updates a vector step (all worlds once)."""
     buffer_size: int = number(50_000_000, low=1)
     """Transitions kept; about 1 kB each."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the networks learn and the replay rows may lie; auto = a GPU where there is
+    one, whichever engine steps the physics."""
+    replay: Literal["auto", "device", "pinned", "cpu"] = "auto"
+    """Where they are kept. auto and device: on the learner's device, the fastest.
+    pinned: in host memory beside a CUDA device that cannot hold them, exchanged through
+    page-locked buffers while both go on. cpu: in host memory, exchanged by plain copies
+    that are waited for."""
+    prefetch: int = number(2, low=0)
+    """Batches that threads gather ahead from host memory (replay pinned or cpu); 0 =
+    none, and then equal runs are equal."""
     min_buffer: int = number(100_000, low=1)
     """Transitions collected before learning."""
     warmup: Literal["uniform", "policy"] = "uniform"
@@ -110,10 +121,13 @@ class AlgoConfig:
     """Exponent of the repetition lengths; larger repeats less."""
     noise_clock: Literal["shared", "per_env_hand"] = "shared"
     """All worlds and hands redraw their noise together, or each by its own clock."""
+    tf32: bool = True
+    """Matrix products of a GPU in TF32: three decimal digits, several times the rate of
+    float32. Nothing on a CPU."""
     bfloat16: bool = False
     """Large matrix products of the updates in bfloat16, everything else in float32."""
     compile: bool = False
-    """Compile the updates: some slow minutes, then faster."""
+    """Compile updates and observations: some slow minutes, then faster."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """Numbers of the PPO baseline."""
 
@@ -149,6 +163,9 @@ class TrainConfig(LoopConfig):
     """Stop once every motion is converted."""
     criterion: Criterion = "sr_mt_obj"
     """What counts as a conversion (see docs on criteria)."""
+    judge: Literal["auto", "inline", "process"] = "auto"
+    """Where attempts are scored and certified: in the loop, or in a process beside it;
+    auto = beside it when the physics is on a GPU, which would wait for it."""
     certify: bool = True
     """Replay each conversion open loop in MuJoCo C and store the verdict."""
     render_conversions: bool = True

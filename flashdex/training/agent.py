@@ -31,7 +31,8 @@ class FlashSACAgent:
         groups: group names; None is a single-agent environment.
         num_envs: worlds that are collected from.
         total_updates: horizon of the learning-rate schedule.
-        generator: source of the exploration and policy noise.
+        generator: source of the exploration and policy noise; its device is that of
+            everything else.
         quiet: key of the worlds that never explore, see `FlashPolicy`.
     """
 
@@ -48,7 +49,7 @@ class FlashSACAgent:
         generator: torch.Generator,
         quiet: NestedKey | None = None,
     ) -> None:
-        self.config = config
+        self.config, self.device = config, generator.device
         number = 1 if groups is None else len(groups)
         self.actor = make_actor(
             config, observation_dim, action_dim, number, future_shape
@@ -71,6 +72,8 @@ class FlashSACAgent:
             reward_normalizer=self.normalizer,
             own_action_gate=config.own_action_gate,
         )
+        # drawn on the CPU, so that a seed means the same weights on every device
+        self.loss.to(self.device)
         self.stepper = FlashSACStepper(
             self.loss,
             lr=config.lr,
@@ -89,7 +92,7 @@ class FlashSACAgent:
             maximum=config.noise_max_repeat,
             clock=config.noise_clock,
             generator=generator,
-        )
+        ).to(self.device)
         self.policy = FlashPolicy(self.actor, groups=groups, noise=noise, quiet=quiet)
 
     def update(self, batch: TensorDictBase) -> TensorDict:

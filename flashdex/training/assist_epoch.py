@@ -20,16 +20,17 @@ class AssistEpoch:
     """Collects what decides whether the assist may fade.
 
     Only assisted worlds count: attempt worlds have no assist, so their failures say
-    nothing about it. Hands without a part in the motion are left out.
+    nothing about it. Hands without a part in the motion are left out. What a step adds
+    stays on its device; the host waits for it once an epoch.
     """
 
     def __init__(self) -> None:
         self._clear()
 
     def _clear(self) -> None:
-        self._sums: dict[str, float] = {}
-        self._count = 0.0
-        self._ended = self._failed = 0
+        self._names: tuple[str, ...] = ()
+        # sums of the terms, then entries, ends and failures
+        self._totals: Tensor | None = None
 
     def step(
         self,
@@ -67,40 +68,52 @@ class AssistEpoch:
             terminated: (N, 1) bool.
         """
         counts = outcome.active & assisted.unsqueeze(-1)
-        self._count += float(counts.sum())
-        for name, value in outcome.terms.items():
-            total = torch.where(counts, torch.nan_to_num(value), 0.0).sum()
-            self._sums[name] = self._sums.get(name, 0.0) + float(total)
-        self._ended += int((done.squeeze(-1) & assisted).sum())
-        self._failed += int((terminated.squeeze(-1) & assisted).sum())
+        terms = torch.nan_to_num(torch.stack(list(outcome.terms.values())))
+        sums = torch.where(counts, terms, 0.0).sum((1, 2))
+        numbers = [
+            counts.sum(),
+            (done.squeeze(-1) & assisted).sum(),
+            (terminated.squeeze(-1) & assisted).sum(),
+        ]
+        total = torch.cat([sums.double(), torch.stack(numbers).double()])
+        names = tuple(outcome.terms)
+        if self._totals is not None and names == self._names:
+            total = total + self._totals.to(total.device)  # a checkpoint's: on the CPU
+        self._names, self._totals = names, total
+
+    def _read(self) -> tuple[dict[str, float], float, int, int]:
+        """Sums of the terms, entries, ends and failures."""
+        if self._totals is None:
+            return {}, 0.0, 0, 0
+        *sums, count, ended, failed = self._totals.tolist()
+        return dict(zip(self._names, sums, strict=True)), count, int(ended), int(failed)
 
     def pop(self) -> dict[str, float]:
         """Means since the last call, each 0..1: arguments of ``end_epoch``."""
+        sums, number, ended, failed = self._read()
 
         def mean(names: tuple[str, ...]) -> float:
-            found = [self._sums[n] for n in names if n in self._sums]
-            count = len(found) * self._count
+            found = [sums[n] for n in names if n in sums]
+            count = len(found) * number
             return sum(found) / count if count else 0.0
 
         out = {
             "task": mean(_TASK[:1]) or mean(_TASK[1:]),
             "imitation": mean(_IMITATION),
             "cloning": mean(_CLONING),
-            "completion": 1.0 - self._failed / self._ended if self._ended else 1.0,
+            "completion": 1.0 - failed / ended if ended else 1.0,
         }
         self._clear()
         return out
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the open epoch."""
-        return {
-            "sums": dict(self._sums),
-            "count": self._count,
-            "ended": self._ended,
-            "failed": self._failed,
-        }
+        sums, count, ended, failed = self._read()
+        return {"sums": sums, "count": count, "ended": ended, "failed": failed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict``."""
-        self._sums, self._count = dict(state["sums"]), state["count"]
-        self._ended, self._failed = state["ended"], state["failed"]
+        self._names = tuple(state["sums"])
+        numbers = [state[name] for name in ("count", "ended", "failed")]
+        values = [*state["sums"].values(), *numbers]
+        self._totals = torch.tensor(values, dtype=torch.float64)

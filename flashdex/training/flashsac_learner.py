@@ -12,7 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.transforms.base import assemble
+from flashdex.envs.transforms.compiled import Assembly
+from flashdex.modules.generator import restore_generator
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
 from flashdex.training.guard import finite_rows
@@ -31,6 +32,7 @@ class FlashSACLearner(ReplayLearner):
         example: one compact state, batch (N,), that fixes the network sizes.
         total_updates: horizon of the learning-rate schedule.
         seed: of networks, exploration and replay.
+        device: where everything lives; ``bank`` and ``example`` are there already.
     """
 
     def __init__(
@@ -42,14 +44,18 @@ class FlashSACLearner(ReplayLearner):
         *,
         total_updates: int,
         seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.bank = bank
         self.groups = HandGroups.of(bank, unified=config.groups == "unified")
-        self.transforms = transforms
-        self.sample_transforms = [t.clone() for t in transforms]
-        generator = torch.Generator().manual_seed(seed)
+        self.transforms = [t.to(device) for t in transforms]
+        generator = torch.Generator(device).manual_seed(seed)
         torch.manual_seed(seed)
-        shown = assemble(transforms, example)
+        self.show = Assembly(self.transforms, compile=config.compile)
+        self.show_rows = Assembly(
+            [t.clone() for t in self.transforms], compile=config.compile
+        )
+        shown = Assembly(self.transforms)(example)
         future = shown.get(keys.FUTURE, None)
         agent = FlashSACAgent(
             config,
@@ -62,7 +68,7 @@ class FlashSACLearner(ReplayLearner):
             generator=generator,
             quiet=keys.ATTEMPT,
         )
-        super().__init__(config, agent, generator)
+        super().__init__(config, agent, generator, ones=("flags",))
         self.codec = RowCodec(bank)
         self._planned = 1  # updates until rows are added
         self._ahead: list[TensorDict] = []  # samples of those updates
@@ -84,7 +90,8 @@ class FlashSACLearner(ReplayLearner):
             state: compact state, batch (N,), with the ``attempt`` flag.
             explore: False makes every world deterministic.
         """
-        shown = assemble(self.transforms, state)
+        shown = self.show(state)
+        shown.set(keys.ATTEMPT, state[keys.ATTEMPT])
         # A resumed learner may start with an empty buffer, but not without a policy.
         trained = self.ready or self.updates > 0
         by_policy = trained or self.config.warmup == "policy"
@@ -93,7 +100,10 @@ class FlashSACLearner(ReplayLearner):
             action = self.groups.join(self.agent.policy(shown))
         if by_policy or not explore:
             return action
-        chance = 2 * torch.rand(action.shape, generator=self.generator) - 1
+        chance = torch.rand(
+            action.shape, generator=self.generator, device=action.device
+        )
+        chance = 2 * chance - 1
         return torch.where(state[keys.ATTEMPT].unsqueeze(-1), action, chance)
 
     def remember(
@@ -107,7 +117,7 @@ class FlashSACLearner(ReplayLearner):
     ) -> None:
         """Update the reward statistics and store what the n-step window yields.
 
-        Rows that are not finite are dropped and counted: one in a thousand samples
+        Rows that are not finite are replaced and counted: one in a thousand samples
         would be enough to lose the networks.
         """
         active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
@@ -126,23 +136,16 @@ class FlashSACLearner(ReplayLearner):
             done,
         )
         if row is not None:
-            self._store(row)
-
-    def _store(self, row: TensorDict) -> None:
-        packed = self.codec.pack(row)
-        # half precision overflows where float32 does not
-        fits = packed["state"].isfinite() & packed["next_state"].isfinite()
-        good = finite_rows(row) & fits.all(-1)
-        bad = len(good) - int(good.sum())
-        self.num_dropped += bad
-        if bad < len(good):
-            self.buffer.extend(packed[good] if bad else packed)
+            packed = self.codec.pack(row)
+            # half precision overflows where float32 does not
+            fits = packed["state"].isfinite() & packed["next_state"].isfinite()
+            self._store(packed, finite_rows(row) & fits.all(-1))
 
     def sample(self, count: int = 1) -> list[TensorDict]:
         """Assembled replay samples: what the loss reads, batch (B,) each."""
         size = self.config.batch_size
-        state, transition = self.codec.unpack(self.buffer.sample(count * size))
-        shown = assemble(self.sample_transforms, state)
+        state, transition = self.codec.unpack(self.buffer.draw(count))
+        shown = self.show_rows(state)
         wanted = [keys.OBSERVATION, keys.GROUP_MASK]
         if shown.get(keys.FUTURE, None) is not None:
             wanted.append(keys.FUTURE)
@@ -181,6 +184,6 @@ class FlashSACLearner(ReplayLearner):
             update: ``last_update`` of the learner that performed it.
         """
         self.last_update = update
-        self.generator.set_state(update["generator"])
+        restore_generator(self.generator, update["generator"])
         batch = TensorDict(update["batch"], batch_size=[update["batch_size"]])
-        return self.agent.update(batch)
+        return self.agent.update(batch.to(self.device))

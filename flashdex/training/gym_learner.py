@@ -29,6 +29,7 @@ class GymLearner(ReplayLearner):
         num_envs: worlds N that are collected from.
         total_updates: horizon of the learning-rate schedule.
         seed: of networks, exploration and replay.
+        device: where everything lives; states are there already.
     """
 
     def __init__(
@@ -40,8 +41,9 @@ class GymLearner(ReplayLearner):
         num_envs: int,
         total_updates: int,
         seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator(device).manual_seed(seed)
         torch.manual_seed(seed)  # initial weights are drawn from the global stream
         agent = FlashSACAgent(
             config,
@@ -51,7 +53,7 @@ class GymLearner(ReplayLearner):
             total_updates=total_updates,
             generator=generator,
         )
-        super().__init__(config, agent, generator)
+        super().__init__(config, agent, generator, ones=(keys.TERMINATED, keys.STEPS))
 
     @torch.no_grad()
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
@@ -65,7 +67,8 @@ class GymLearner(ReplayLearner):
         trained = self.ready or self.updates > 0 or self.config.warmup == "policy"
         if explore and not trained:
             shape = (state.batch_size[0], self.agent.actor.action_dim)
-            return 2 * torch.rand(shape, generator=self.generator) - 1
+            chance = torch.rand(shape, generator=self.generator, device=self.device)
+            return 2 * chance - 1
         kind = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
         with set_exploration_type(kind):
             return self.agent.policy(state.copy())[keys.ACTION]
@@ -81,21 +84,16 @@ class GymLearner(ReplayLearner):
     ) -> None:
         """Update the reward statistics and store what the n-step window yields.
 
-        Rows that are not finite are dropped and counted.
+        Rows that are not finite are replaced and counted.
         """
         finite = reward.isfinite()
         clean = torch.where(finite, reward, 0.0)
         self.agent.normalizer.update(clean, done, finite)
         row = self.nstep.push(state, action, reward, next_state, terminated, done)
         if row is not None:
-            self._store(row)
+            self._store(self._pack(row), finite_rows(row))
 
-    def _store(self, row: TensorDict) -> None:
-        good = finite_rows(row)
-        bad = len(good) - int(good.sum())
-        self.num_dropped += bad
-        if bad == len(good):
-            return
+    def _pack(self, row: TensorDict) -> TensorDict:
         after = row["next_state", keys.OBSERVATION]
         flat = {
             keys.OBSERVATION: row["state", keys.OBSERVATION],
@@ -106,12 +104,11 @@ class GymLearner(ReplayLearner):
             keys.TERMINATED: row["terminated"],
             keys.STEPS: row["steps"].to(torch.int16),
         }
-        rows = TensorDict(flat, batch_size=row.batch_size)
-        self.buffer.extend(rows[good] if bad else rows)
+        return TensorDict(flat, batch_size=row.batch_size)
 
     def sample(self) -> TensorDict:
         """A replay sample as the loss reads it, batch (B,)."""
-        row = self.buffer.sample(self.config.batch_size)
+        row = self.buffer.draw()
         return TensorDict(
             {
                 keys.OBSERVATION: row[keys.OBSERVATION],

@@ -31,13 +31,11 @@ class GymStats(RunningStats):
         self._steps += 1
         self._returns += torch.where(reward.isfinite(), reward, 0.0)
         self._lengths += 1
-        ended, failed = int(done.sum()), int(terminated.sum())
-        if not ended:
+        self.add_ends(done, terminated)
+        if not done.any():
             return
-        self._ends["terminated"] += failed
-        self._ends["truncated"] += ended - failed
         finished = {"episode/return": self._returns, "episode/length": self._lengths}
-        for key, value in finished.items():
-            self._sums[key] += float(value[done].sum())
-            self._counts[key] += ended
+        sums = [value[done].double().sum() for value in finished.values()]
+        self.add(list(finished), torch.stack(sums), done.sum())
+        for value in finished.values():
             value[done] = 0

@@ -31,6 +31,11 @@ class HandGroups:
     hands: tuple[int, ...]
     action_dim: int
 
+    @property
+    def _range(self) -> slice:
+        # by a slice: a list as an index is copied to the device each time
+        return slice(self.hands[0], self.hands[-1] + 1)
+
     @classmethod
     def of(cls, bank: ReferenceBank, *, unified: bool) -> HandGroups:
         """Groups for the motions of ``bank``; one hand alone is never unified."""
@@ -49,7 +54,7 @@ class HandGroups:
         actions = torch.cat([td[group, keys.ACTION] for group in self.names], -1)
         actions = actions.unflatten(-1, (len(self.hands), -1))
         joint = actions.new_zeros(len(actions), 2, actions.shape[-1])
-        joint[:, self.hands] = actions
+        joint[:, self._range] = actions
         return joint
 
     def actions(self, joint: Tensor) -> list[Tensor]:
@@ -63,10 +68,10 @@ class HandGroups:
         """Rewards (B, 2) of the hands as rewards (B, G) of the groups."""
         if self.is_unified:
             return reward.sum(-1, keepdim=True)
-        return reward[:, self.hands]
+        return reward[:, self._range]
 
     def mask(self, active: Tensor) -> Tensor:
         """Where a group takes part, (B, G) bool, from that of the hands (B, 2)."""
         if self.is_unified:
             return torch.ones_like(active[:, :1])
-        return active[:, self.hands]
+        return active[:, self._range]

@@ -21,10 +21,13 @@ class NStepAssembler:
     Args:
         n_step: longest window.
         gamma: discount a step.
+        device: of the steps.
     """
 
-    def __init__(self, n_step: int, *, gamma: float) -> None:
-        self.n_step, self.gamma = n_step, gamma
+    def __init__(
+        self, n_step: int, *, gamma: float, device: torch.device | None = None
+    ) -> None:
+        self.n_step, self.gamma, self.device = n_step, gamma, device
         self._steps: deque[TensorDict] = deque(maxlen=n_step)
 
     def push(
@@ -99,7 +102,10 @@ class NStepAssembler:
         self._steps.clear()
         for step in state["steps"]:
             size = step["done"].shape[:1]
-            self._steps.append(TensorDict(step, batch_size=size))
+            loaded = TensorDict(step, batch_size=size)
+            self._steps.append(
+                loaded if self.device is None else loaded.to(self.device)
+            )
 
 
 def _select(mask: Tensor, new: TensorDict, old: TensorDict) -> TensorDict:

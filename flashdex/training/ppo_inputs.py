@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
-from flashdex.envs.transforms.base import assemble
+from flashdex.envs.transforms.compiled import Assembly
 from flashdex.modules.running_norm import RunningNorm
 from flashdex.training.hand_groups import HandGroups
 
@@ -24,6 +24,7 @@ class PPOInputs:
         transforms: observation transforms in data-flow order.
         groups: how the hands are divided.
         example: one compact state, batch (N,), that fixes the sizes.
+        compile: compile the assembly.
     """
 
     def __init__(
@@ -31,9 +32,12 @@ class PPOInputs:
         transforms: list[Transform],
         groups: HandGroups,
         example: TensorDictBase,
+        *,
+        compile: bool = False,
     ) -> None:
         self.transforms, self.groups = transforms, groups
-        shown = assemble(transforms, example)
+        self.show = Assembly(transforms, compile=compile)
+        shown = Assembly(transforms)(example)
         wanted = (keys.OBSERVATION, keys.FUTURE)
         self.keys = [k for k in wanted if shown.get(k, None) is not None]
         self.observation_dim = shown[keys.OBSERVATION].shape[-1]
@@ -42,7 +46,7 @@ class PPOInputs:
             channels, frames = shown[keys.FUTURE].shape[1:]
             self.future_shape = (channels, frames)
         norms = {key: RunningNorm(shown[key].shape[1]) for key in self.keys}
-        self.norms = nn.ModuleDict(norms)
+        self.norms = nn.ModuleDict(norms).to(example[keys.JOINT_POS].device)
 
     @property
     def fitted(self) -> bool:
@@ -62,7 +66,7 @@ class PPOInputs:
         """
         parts = []
         for chunk in state.split(CHUNK):
-            shown = assemble(self.transforms, chunk)
+            shown = self.show(chunk)
             row: dict[str, Tensor] = {key: shown[key] for key in self.keys}
             mask = self.groups.mask(shown[keys.GROUP_MASK])
             for value in row.values():

@@ -14,6 +14,7 @@ from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
 from flashdex.errors import RunError
 from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
+from flashdex.modules.generator import restore_generator
 from flashdex.objectives.ppo import PPO, bootstrap_rows
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.recipe import AlgoConfig
@@ -41,6 +42,7 @@ class PPOLearner:
         bank: reference frames.
         example: one compact state, batch (N,), that fixes the network sizes.
         seed: of networks, actions and minibatches.
+        device: where everything lives; ``bank`` and ``example`` are there already.
     """
 
     is_off_policy = False
@@ -53,12 +55,16 @@ class PPOLearner:
         example: TensorDictBase,
         *,
         seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
-        self.config, self.bank = config, bank
+        self.config, self.bank, self.device = config, bank, torch.device(device)
         self.groups = HandGroups.of(bank, unified=config.groups == "unified")
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(device).manual_seed(seed)
         torch.manual_seed(seed)
-        self.inputs = PPOInputs(transforms, self.groups, example)
+        transforms = [t.to(device) for t in transforms]
+        self.inputs = PPOInputs(
+            transforms, self.groups, example, compile=config.compile
+        )
         self.agents = {
             name: make_ppo(config, self.inputs, self.groups.action_dim, self.generator)
             for name in self.groups.names
@@ -68,8 +74,10 @@ class PPOLearner:
             len(self.groups.names),
             gamma=config.gamma,
             bound=config.v_max,
-        )
-        self.num_dropped = 0  # steps whose reward was not finite
+        ).to(device)
+        # looked up once: which worlds attempt never changes
+        self._train_rows = (~example[keys.ATTEMPT].squeeze(-1)).nonzero().squeeze(-1)
+        self._dropped = torch.zeros((), dtype=torch.int64, device=device)
         self._updates = 0
         self._rollout: list[TensorDict] = []
 
@@ -122,7 +130,7 @@ class PPOLearner:
         active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
         reward = self.groups.rewards(reward)
         finite = reward.isfinite()
-        self.num_dropped += int((~finite & train).any(-1).sum())
+        self._dropped += (~finite & train).any(-1).sum()
         reward = torch.where(finite, reward, 0.0)
         counts = self.groups.mask(active) & train & finite
         self.normalizer.update(reward, done, counts)
@@ -138,7 +146,7 @@ class PPOLearner:
             },
             [len(action)],
         )
-        self._rollout.append(cast(TensorDict, step[train.squeeze(-1)]))
+        self._rollout.append(cast(TensorDict, step[self._train_rows]))
 
     def due(self) -> int:
         """1 once the rollout is full; the first one only sets the input statistics."""
@@ -197,6 +205,11 @@ class PPOLearner:
         return report
 
     @property
+    def num_dropped(self) -> int:
+        """Steps whose reward was not finite; waits for the device."""
+        return int(self._dropped)
+
+    @property
     def updates(self) -> int:
         """Rollouts learnt from so far."""
         return self._updates
@@ -240,9 +253,9 @@ class PPOLearner:
             agent.load_state_dict(state["agents"][name])
         self.inputs.load_state_dict(state["inputs"])
         self.normalizer.load_state_dict(state["normalizer"])
-        self.generator.set_state(state["generator"])
+        restore_generator(self.generator, state["generator"])
         self._updates = state["updates"]
-        self.num_dropped = state["dropped"]
+        self._dropped.fill_(state["dropped"])
         self._rollout.clear()
 
 
@@ -259,9 +272,10 @@ def make_ppo(
         encoder=make_encoder(config, shape, 1),
     )
     value = ValueNet(width, hidden=ppo.hidden, encoder=make_encoder(config, shape, 1))
+    device = generator.device
     return PPO(
-        policy,
-        value,
+        policy.to(device),
+        value.to(device),
         gamma=config.gamma,
         gae_lambda=ppo.gae_lambda,
         clip=ppo.clip,

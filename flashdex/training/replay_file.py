@@ -13,7 +13,7 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -21,6 +21,7 @@ from torchrl.data import ReplayBuffer
 
 from flashdex.files import open_atomic, write_atomic
 from flashdex.training.checkpoint import FOLDER
+from flashdex.training.replay_store import RowBuffer
 
 _LOG = logging.getLogger(__name__)
 REPLAY = "replay"
@@ -88,6 +89,8 @@ class ReplayLog:
         if not self.enabled:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
+        if isinstance(self.buffer, RowBuffer):
+            self.buffer.flush()  # rows on their way count as stored
         self._count()
         oldest = self._written - len(self.buffer)
         kept = [s for s in self._segments if s.end > oldest]
@@ -113,14 +116,15 @@ class ReplayLog:
         if start == self._written:
             return []
         cursor = self.buffer.writer.state_dict()["_cursor"]
-        row = self.buffer.storage[0]
+        storage: Any = self.buffer.storage
+        row = storage[0]
         width = sum(v.numel() * v.element_size() for v in row.values(True, True))
         size = max(1, PART_BYTES // max(width, 1))
         out = []
         for first in range(start, self._written, size):
             end = min(first + size, self._written)
-            index = (cursor - self._written + torch.arange(first, end)) % self.capacity
-            rows = self.buffer.storage[index].cpu()
+            number = torch.arange(first, end, device=storage.device)
+            rows = storage[(cursor - self._written + number) % self.capacity].cpu()
             segment = Segment(f"{stem}-{len(out)}.pt", first, end - first)
             with open_atomic(self.folder / segment.file) as file:
                 torch.save(rows.to_dict(), file)
@@ -169,14 +173,14 @@ class ReplayLog:
         oldest = written - min(manifest["rows"], self.capacity)
         first = (manifest["written"] - manifest["rows"]) if same else 0
         # Row numbers and ring positions differ by a constant, as the ring began at 0.
-        writer = self.buffer.writer
+        writer, storage = self.buffer.writer, cast(Any, self.buffer.storage)
         writer.load_state_dict({"_cursor": first % self.capacity if same else 0})
         for segment in segments:
             content = torch.load(self.folder / segment.file, weights_only=True)
             rows = TensorDict(content, batch_size=[segment.rows])
             rows = rows[max(0, oldest - segment.first) :]
             if len(rows):
-                self.buffer.extend(rows)
+                self.buffer.extend(rows.to(storage.device))
         if len(self.buffer) != written - oldest:
             msg = f"{len(self.buffer)} rows instead of {written - oldest}"
             raise ValueError(msg)

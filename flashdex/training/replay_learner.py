@@ -2,46 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import torch
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from tensordict import TensorDict
+from torch import Tensor
 
+from flashdex.modules.generator import restore_generator
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
 from flashdex.training.checkpoint import snapshot
 from flashdex.training.nstep import NStepAssembler
+from flashdex.training.replay_store import make_buffer
+from flashdex.training.row_patch import RowPatch
 
 
 class ReplayLearner:
     """Counters, replay and state of an off-policy learner.
 
     Subclasses make the agent, act, pack rows and sample them; see
-    `flashdex.training.learner.Learner`.
+    `flashdex.training.learner.Learner`. A vector step and an update never make the host
+    wait for the device.
 
     Args:
         config: algorithm part of the recipe.
-        agent: what learns.
-        generator: of the agent's noise; it also draws the replay samples.
+        agent: what learns; its device is that of the learner.
+        generator: of the agent's noise; it also draws the replay samples, unless those
+            are drawn elsewhere, see `flashdex.training.replay_store.make_buffer`.
+        ones: leaves of a row that are 1 in a blank one, see `RowPatch`.
     """
 
     is_off_policy = True
 
     def __init__(
-        self, config: AlgoConfig, agent: FlashSACAgent, generator: torch.Generator
+        self,
+        config: AlgoConfig,
+        agent: FlashSACAgent,
+        generator: torch.Generator,
+        *,
+        ones: Collection[str] = (),
     ) -> None:
         self.config, self.agent, self.generator = config, agent, generator
-        self.nstep = NStepAssembler(config.n_step, gamma=config.gamma)
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(config.buffer_size), generator=generator
+        self.device = agent.device
+        self.nstep = NStepAssembler(
+            config.n_step, gamma=config.gamma, device=self.device
         )
+        self.buffer = make_buffer(
+            config,
+            device=self.device,
+            generator=generator,
+            seed=generator.initial_seed(),
+        )
+        self._patch = RowPatch(self.device, ones=ones)
         self._debt = 0.0
-        self.num_dropped = 0  # rows that were not finite
 
     @property
     def ready(self) -> bool:
         """Whether the replay buffer holds enough rows to learn from."""
-        return len(self.buffer) >= self.config.min_buffer
+        return self.num_rows >= self.config.min_buffer
+
+    @property
+    def num_dropped(self) -> int:
+        """Rows that were not finite and gave way to others; waits for the device."""
+        return self._patch.count
 
     @property
     def updates(self) -> int:
@@ -51,7 +75,11 @@ class ReplayLearner:
     @property
     def num_rows(self) -> int:
         """Rows of the replay buffer."""
-        return len(self.buffer)
+        return self.buffer.num_rows
+
+    def _store(self, rows: TensorDict, good: Tensor) -> None:
+        """Store flat rows, (N,), of which only those of ``good``, (N,), are sound."""
+        self.buffer.push(self._patch(rows, good))
 
     def due(self) -> int:
         """Updates to perform now; a fraction is carried to the next vector step."""
@@ -70,13 +98,16 @@ class ReplayLearner:
     def state_dict(self) -> dict[str, Any]:
         """A copy of agent, n-step tail and update debt; replay rows are no part of it.
 
-        The generator is the agent's: it also draws the replay samples.
+        The generator is the agent's; one that only draws replay samples goes along.
         """
+        sampler = self.buffer.generator
+        is_own = sampler is not self.generator
         state = {
             "agent": self.agent.state_dict(),
             "nstep": self.nstep.state_dict(),
             "debt": self._debt,
             "dropped": self.num_dropped,
+            "sampler": sampler.get_state() if is_own else None,
         }
         return snapshot(state)
 
@@ -87,4 +118,7 @@ class ReplayLearner:
         self.agent.load_state_dict(state["agent"])
         self.nstep.load_state_dict(state["nstep"])
         self._debt = state["debt"]
-        self.num_dropped = state["dropped"]
+        self._patch.count = state["dropped"]
+        sampler = state.get("sampler")
+        if sampler is not None and self.buffer.generator is not self.generator:
+            restore_generator(self.buffer.generator, sampler)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -17,29 +17,50 @@ from flashdex import keys
 if TYPE_CHECKING:
     from flashdex.envs.judge import Outcome
 
+Names = tuple[str, ...]
+
 
 class RunningStats:
-    """Collects means of rewards, errors, episode ends, losses and phase times."""
+    """Collects means of rewards, errors, episode ends, losses and phase times.
+
+    What a step or an update adds stays on its device, many numbers in one tensor; the
+    host waits for them once, when they are logged.
+    """
 
     def __init__(self) -> None:
         self._clear()
 
     def _clear(self) -> None:
-        self._sums: dict[str, float | Tensor] = defaultdict(float)
-        self._counts: dict[str, float | Tensor] = defaultdict(float)
+        self._tables: dict[Names, tuple[Tensor, Tensor]] = {}
         self._seconds: dict[str, float] = defaultdict(float)
         self._calls: dict[str, int] = defaultdict(int)
-        self._ends = {"terminated": 0, "truncated": 0}
-        self._causes: dict[str, int] = defaultdict(int)
+        self._ends: dict[Names, Tensor] = {}
         self._steps = 0
 
     @contextmanager
     def time(self, phase: str) -> Iterator[None]:
-        """Add the time spent inside to ``perf/ms_<phase>``."""
+        """Add the time spent inside to ``perf/ms_<phase>``.
+
+        On a GPU that is the time the host takes, which does not wait for the device.
+        """
         start = time.perf_counter()
         yield
         self._seconds[phase] += time.perf_counter() - start
         self._calls[phase] += 1
+
+    def add(self, names: Sequence[str], sums: Tensor, counts: Tensor) -> None:
+        """Take in sums, and over how many values each of them goes.
+
+        Args:
+            names: what is logged, K of them, the same at every call of their kind.
+            sums: (K,).
+            counts: (K,), or () for all.
+        """
+        sums, counts = sums.double(), counts.double().expand(len(names))
+        known = self._tables.get(tuple(names))
+        if known is not None:
+            sums, counts = known[0] + sums, known[1] + counts
+        self._tables[tuple(names)] = sums, counts
 
     def add_step(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
         """Take in one judged vector step.
@@ -50,49 +71,62 @@ class RunningStats:
             terminated: (N, 1) bool.
         """
         self._steps += 1
-        active = outcome.active
         values = {f"reward/{{side}}/{k}": v for k, v in outcome.terms.items()}
         values["reward/{side}/total"] = outcome.reward
         values["error/{side}/object_pos_mm"] = outcome.object_pos_error * 1e3
         degrees = torch.rad2deg(outcome.object_rot_error)
         values["error/{side}/object_rot_deg"] = degrees
-        count = active.float().sum(0)
-        for name, value in values.items():
-            total = torch.where(active, torch.nan_to_num(value), 0.0).sum(0)
-            for i, side in enumerate(keys.SIDES):
-                key = name.format(side=side)
-                self._sums[key] = self._sums[key] + total[i]
-                self._counts[key] = self._counts[key] + count[i]
-        failed = int(terminated.sum())
-        ended = int(done.sum())
-        self._ends["terminated"] += failed
-        self._ends["truncated"] += ended - failed
-        for name, cause in outcome.causes.items():
-            self._causes[name] += int(cause.any(-1).sum())
+        names = [name.format(side=side) for name in values for side in keys.SIDES]
+        found = torch.nan_to_num(torch.stack(list(values.values())))  # (K, N, 2)
+        active = outcome.active
+        sums = torch.where(active, found, 0.0).sum(1)
+        counts = active.sum(0).expand_as(sums)
+        self.add(names, sums.flatten(), counts.flatten())
+        self.add_ends(done, terminated, outcome.causes)
+
+    def add_ends(
+        self, done: Tensor, terminated: Tensor, causes: dict[str, Tensor] | None = None
+    ) -> None:
+        """Count the episodes that ended.
+
+        Args:
+            done: (N, 1) bool.
+            terminated: (N, 1) bool.
+            causes: for what; (N, 2) bool each, by hand.
+        """
+        causes = causes or {}
+        ends = [done.sum(), terminated.sum()]
+        ends += [cause.any(-1).sum() for cause in causes.values()]
+        names, total = tuple(causes), torch.stack(ends)
+        known = self._ends.get(names)
+        self._ends[names] = total if known is None else known + total
 
     def add_update(self, metrics: TensorDictBase) -> None:
         """Take in the metrics of one update."""
+        names, values = [], []
         for key, value in metrics.items(True, True):
-            full = "loss/" + ("/".join(key) if isinstance(key, tuple) else key)
-            self._sums[full] = self._sums[full] + value.detach().float().mean()
-            self._counts[full] = self._counts[full] + 1
+            names.append("loss/" + ("/".join(key) if isinstance(key, tuple) else key))
+            values.append(value.detach().double().mean())
+        found = torch.stack(values)
+        self.add(names, found, torch.ones_like(found))
 
     def pop(self, seconds: float, num_envs: int) -> dict[str, float]:
-        """Means since the last call, and forget them.
+        """Means since the last call, and forget them; waits for the device.
 
         Args:
             seconds: time since the last call.
             num_envs: worlds of a vector step.
         """
-        out = {
-            key: float(total) / max(float(self._counts[key]), 1e-9)
-            for key, total in self._sums.items()
-        }
-        ends = sum(self._ends.values())
-        out["episode/ends"] = float(ends)
-        out["episode/completed"] = self._ends["truncated"] / ends if ends else 0.0
-        for name, count in self._causes.items():
-            out[f"episode/{name}"] = count / ends if ends else 0.0
+        out = {"episode/ends": 0.0, "episode/completed": 0.0}
+        for names, (sums, counts) in self._tables.items():
+            means = (sums / counts.clamp_min(1e-9)).tolist()
+            out.update(zip(names, means, strict=True))
+        for names, ends in self._ends.items():
+            ended, failed, *causes = ends.tolist()
+            out["episode/ends"] = float(ended)
+            out["episode/completed"] = (ended - failed) / ended if ended else 0.0
+            for name, count in zip(names, causes, strict=True):
+                out[f"episode/{name}"] = count / ended if ended else 0.0
         out["perf/env_steps_per_s"] = self._steps * num_envs / seconds
         for phase, spent in self._seconds.items():
             out[f"perf/ms_{phase}"] = 1e3 * spent / max(self._calls[phase], 1)

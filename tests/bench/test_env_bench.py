@@ -7,25 +7,26 @@ import json
 import pytest
 import torch
 
+from flashdex.bench import duel
 from flashdex.bench import env as bench
 
 
 def test_bare_physics_follows_the_environment_bit_for_bit(make_env):
     env = make_env(3, evaluation=True, finger_mode="residual")
     env.forced_motion = torch.arange(3)
-    duel = bench.Duel(env, num_threads=1)
+    both = duel.Duel(env, num_threads=1)
     for _ in range(2):  # 20 steps: no motion has ended, so no world was reset
-        segment = duel.run()
+        segment = both.run()
         assert segment.env > 0
         assert segment.physics > 0
-        assert (duel.bare.bind("qpos") == env.physics.batch.bind("qpos")).all()
+        assert (both.bare.bind("qpos") == env.physics.batch.bind("qpos")).all()
         assert (
-            duel.bare.bind("sensordata") == env.physics.batch.bind("sensordata")
+            both.bare.bind("sensordata") == env.physics.batch.bind("sensordata")
         ).all()
 
 
 def test_measure_gives_rates_and_their_ratio(make_env):
-    out = bench.measure(make_env(4), num_threads=1, seconds=0.1)
+    out = duel.measure(make_env(4), num_threads=1, seconds=0.1)
     assert out["segments"] >= 3
     rates = out["env_steps_per_s"], out["physics_env_steps_per_s"]
     assert 0 < rates[0] < rates[1]

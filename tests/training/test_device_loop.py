@@ -55,9 +55,8 @@ def make_trainer(make_bench, tmp_path):
     return make
 
 
-@pytest.mark.parametrize("kind", ["flashsac", "ppo"])
-def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer, kind):
-    algo = {"kind": kind, "min_buffer": 20, "updates_per_step": 2.0}
+def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer):
+    algo = {"min_buffer": 20, "updates_per_step": 2.0}
     trainer = make_trainer("warp", algo=algo, assist=AssistConfig(enabled=True))
     td = trainer.env.reset()
     trainer.attempts.begin()
@@ -68,8 +67,7 @@ def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer, kind):
         with forbid_sync():
             for _ in range(LOOK_EVERY - 1):
                 td = trainer.vector_step(td)
-    if kind == "flashsac":
-        assert trainer.learner.updates == before + 2 * (LOOK_EVERY - 1)
+    assert trainer.learner.updates == before + 2 * (LOOK_EVERY - 1)
     trainer.alongside.close()
     assert trainer.stats.pop(1.0, 4)["episode/ends"] > 0
 

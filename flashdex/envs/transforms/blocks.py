@@ -143,6 +143,7 @@ class FutureWindow(StateTransform):
         self.bank = bank
         self.horizon = horizon
         self.reference_offset = reference_offset
+        self.hands = slice(bank.used_hands[0], bank.used_hands[-1] + 1)
 
     def assemble(self, td: TensorDictBase) -> dict[NestedKey, Tensor]:
         """See ``features.future_window``."""
@@ -155,7 +156,7 @@ class FutureWindow(StateTransform):
         mask = td[keys.GROUP_MASK][..., None, None]
         values = torch.where(mask, values, torch.zeros_like(values))
         values = torch.nan_to_num(values).clamp(-100.0, 100.0)
-        return {keys.FUTURE: values[:, self.bank.used_hands].flatten(1, 2)}
+        return {keys.FUTURE: values[:, self.hands].flatten(1, 2)}
 
 
 def _own(td: TensorDictBase, *names: str) -> list[Tensor]:

@@ -101,7 +101,8 @@ class Block(StateTransform):
             in_keys=[keys.KIN, keys.REF, keys.OWN, keys.GROUP_MASK],
             out_keys=[(keys.BLOCKS, name)],
         )
-        self.name, self.used_hands = name, used_hands
+        # a slice: a list as an index is copied to the device at every call
+        self.name, self.hands = name, slice(used_hands[0], used_hands[-1] + 1)
 
     def features(self, td: TensorDictBase) -> Tensor:
         """Features of both hands, (N, 2, D)."""
@@ -114,7 +115,7 @@ class Block(StateTransform):
         if self.needs_object:
             mask = mask & td[keys.OWN, "present"]
         values = torch.where(mask, values, torch.zeros_like(values))
-        return {(keys.BLOCKS, self.name): values[:, self.used_hands].flatten(1)}
+        return {(keys.BLOCKS, self.name): values[:, self.hands].flatten(1)}
 
 
 class ConcatBlocks(StateTransform):

@@ -1,0 +1,242 @@
+"""Where replay rows live: on the learner's device, or in host memory beside it.
+
+A row is about 1 kB, so the paper's 50 million rows are about 50 GB: they fit on the
+largest accelerators and into the memory of most hosts. In host memory threads gather
+the coming batches, and rows and batches cross over without the host waiting for the
+device.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from flashdex.errors import FlashdexError
+from flashdex.recipe import AlgoConfig
+from flashdex.training.replay_ring import RowStorage, RowWriter
+from flashdex.training.rows import row_bytes
+
+# Pushes that rows may be on their way to the host. They are waited for after that
+# many vector steps, when they have long arrived, so that runs repeat themselves.
+STAGES = 2
+
+
+class RowBuffer(ReplayBuffer):
+    """Rows on the learner's device, where the sampling indices are drawn, too.
+
+    Args:
+        capacity: rows of the ring.
+        batch_size: rows B of one batch.
+        device: of the learner.
+        generator: draws the samples.
+        kept_on: where the rows are kept instead.
+        prefetch: batches that threads gather ahead; 0 gathers when asked.
+        pinned: copy gathered rows into page-locked memory.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        batch_size: int,
+        device: torch.device,
+        generator: torch.Generator,
+        kept_on: torch.device | None = None,
+        prefetch: int = 0,
+        pinned: bool = False,
+    ) -> None:
+        self.ring = RowStorage(capacity, device=kept_on or device)
+        super().__init__(
+            storage=self.ring,
+            writer=RowWriter(),
+            generator=generator,
+            pin_memory=pinned,
+            prefetch=prefetch or None,
+            # what threads gather has one size; otherwise every draw may have its own
+            batch_size=batch_size if prefetch else None,
+        )
+        self.capacity, self.rows_per_batch = capacity, batch_size
+        self.learner_device, self.generator = device, generator
+
+    @property
+    def num_rows(self) -> int:
+        """Rows that can be sampled; asking waits for no thread."""
+        return len(self.ring)
+
+    def push(self, rows: TensorDict) -> None:
+        """Store packed rows, (N,), of the learner's device.
+
+        Raises:
+            FlashdexError: the ring does not fit into memory.
+        """
+        self._write(rows)
+
+    def _write(self, rows: TensorDict) -> None:
+        try:
+            self.extend(rows)
+        except RuntimeError as error:
+            if self.ring.initialized:
+                raise
+            raise self._too_large(rows) from error
+
+    def _too_large(self, rows: TensorDict) -> FlashdexError:
+        width = row_bytes(rows)
+        return FlashdexError(
+            f"algo.buffer_size: {self.capacity} rows of {width} bytes are "
+            f"{self.capacity * width / 1e9:.1f} GB, which {self.ring.device} cannot "
+            "hold. Choose fewer rows, or on a CUDA device algo.replay=pinned, which "
+            "keeps them in host memory."
+        )
+
+    def draw(self, count: int = 1) -> TensorDictBase:
+        """Rows of ``count`` batches on the learner's device, (count B,)."""
+        return self.sample(count * self.rows_per_batch)
+
+    def flush(self) -> None:
+        """Make every pushed row one that can be sampled and read."""
+
+
+class HostBuffer(RowBuffer):
+    """Rows in host memory, whatever the learner's device.
+
+    Rows that are pushed are copied to the host without waiting for them. They can be
+    sampled ``stages`` pushes later: never before they have arrived, and always at the
+    same push. Threads gather whole batches ahead, under the lock that writing takes, so
+    that no row is ever read half written.
+
+    Args:
+        capacity: rows of the ring.
+        batch_size: rows B of one batch.
+        device: of the learner.
+        generator: draws the samples, on the host; with ``prefetch`` nobody else may
+            draw from it.
+        prefetch: batches that threads gather ahead; 0 gathers when asked.
+        stages: pushes that rows may be on their way.
+        pinned: exchange rows through page-locked memory, which a CUDA device copies
+            from and to while host and device go on.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        batch_size: int,
+        device: torch.device,
+        generator: torch.Generator,
+        prefetch: int = 0,
+        stages: int = STAGES,
+        pinned: bool = False,
+    ) -> None:
+        super().__init__(
+            capacity,
+            batch_size=batch_size,
+            device=device,
+            generator=generator,
+            kept_on=torch.device("cpu"),
+            prefetch=prefetch,
+            pinned=pinned,
+        )
+        self.prefetch, self.stages, self.pinned = prefetch, stages, pinned
+        self._coming: deque[tuple[TensorDict, torch.cuda.Event | None]] = deque()
+
+    def push(self, rows: TensorDict) -> None:
+        """Send packed rows, (N,), on their way; write those that must have arrived."""
+        self._coming.append(self._send(rows))
+        while len(self._coming) > self.stages:
+            self._land()
+
+    def _send(self, rows: TensorDict) -> tuple[TensorDict, torch.cuda.Event | None]:
+        if self.learner_device.type == "cpu":
+            return rows, None
+        # The allocator of pinned memory hands the same few blocks out again.
+        copies = {
+            key: torch.empty(
+                leaf.shape, dtype=leaf.dtype, pin_memory=self.pinned
+            ).copy_(leaf, non_blocking=self.pinned)
+            for key, leaf in rows.items()
+        }
+        event = None
+        if self.pinned:
+            event = torch.cuda.Event()
+            event.record(torch.cuda.current_stream(self.learner_device))
+        return TensorDict(copies, batch_size=rows.batch_size), event
+
+    def _land(self) -> None:
+        rows, event = self._coming.popleft()
+        if event is not None:
+            event.synchronize()
+        self._write(rows)
+
+    def draw(self, count: int = 1) -> TensorDictBase:
+        """Rows of ``count`` batches on the learner's device, (count B,)."""
+        if not self.prefetch:
+            return self._to_learner(self.sample(count * self.rows_per_batch))
+        batches = [self._to_learner(self.sample()) for _ in range(count)]
+        return batches[0] if count == 1 else torch.cat(batches)  # pyright: ignore[reportReturnType,reportArgumentType,reportCallIssue]
+
+    def _to_learner(self, rows: TensorDictBase) -> TensorDictBase:
+        if self.learner_device.type == "cpu":
+            return rows
+        return rows.to(self.learner_device, non_blocking=self.pinned)
+
+    def flush(self) -> None:
+        """Wait for the rows on their way and write them."""
+        while self._coming:
+            self._land()
+
+    def empty(self, empty_write_count: bool = True) -> None:
+        """Forget all rows, those on their way included."""
+        self._coming.clear()
+        super().empty(empty_write_count)
+
+
+def make_buffer(
+    config: AlgoConfig, *, device: torch.device, generator: torch.Generator, seed: int
+) -> RowBuffer:
+    """The replay buffer of a recipe.
+
+    Args:
+        config: algorithm part of the recipe.
+        device: of the learner.
+        generator: of the learner, on its device; it draws the samples as long as they
+            are drawn there, one after the other.
+        seed: of another one otherwise.
+
+    Raises:
+        FlashdexError: pinned memory without a CUDA device, or it cannot be had.
+    """
+    sizes = {"batch_size": config.batch_size, "device": device}
+    if config.replay in ("auto", "device"):
+        return RowBuffer(config.buffer_size, generator=generator, **sizes)
+    pinned = config.replay == "pinned"
+    if pinned:
+        _check_pinning(device)
+    if device.type != "cpu" or config.prefetch:
+        generator = torch.Generator().manual_seed(seed)
+    return HostBuffer(
+        config.buffer_size,
+        generator=generator,
+        prefetch=config.prefetch,
+        stages=STAGES if pinned else 0,
+        pinned=pinned,
+        **sizes,
+    )
+
+
+def _check_pinning(device: torch.device) -> None:
+    if device.type != "cuda":
+        raise FlashdexError(
+            "algo.replay: 'pinned' exchanges rows with a CUDA device, and this learner "
+            f"is on '{device}'. Use algo.replay=auto, which keeps them there."
+        )
+    try:
+        torch.empty(1, pin_memory=True)
+    except RuntimeError as error:
+        raise FlashdexError(
+            f"algo.replay: no pinned memory can be had here ({error}). Use "
+            "algo.replay=cpu, which needs none and waits for every copy, or "
+            "algo.replay=device."
+        ) from error

@@ -1,168 +1,128 @@
-"""``flashdex bench env``: the tracking environment against bare ``mujoco.batch``.
-
-Both step the very same models from the same states under the same controls, by turns
-in one process, so that what else runs on the machine slows both alike. The ratio is
-what the environment costs: 1 would be nothing but physics.
-"""
+"""``flashdex bench env``: the tracking environment against its physics alone."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
-from dataclasses import dataclass
-from statistics import median
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from mujoco.batch import Batch
-from tensordict import TensorDictBase
 
-from flashdex import keys
-from flashdex.bench.machine import describe_commit, describe_hardware
+from flashdex.bench import duel, turns
+from flashdex.bench.clock import memory_gb
+from flashdex.bench.library import bench_library, describe_scene
+from flashdex.bench.output import add_output_options, emit
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.setup import open_workbench
-
-SEGMENT = 10  # control steps by which the two take turns, from equal states
-BURN_IN = 4  # segments that are not counted
-STATE = ("qpos", "qvel", "qacc_warmstart")
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Seconds that one segment took.
-
-    Attributes:
-        env: environment steps with their resets, s.
-        physics: the same controls on bare physics, s.
-    """
-
-    env: float
-    physics: float
-
-
-class Duel:
-    """The environment and a bare batch that follows it segment by segment.
-
-    Args:
-        env: environment on the cpu engine.
-        num_threads: threads of the bare batch; as the environment's.
-        seed: of the random actions.
-    """
-
-    def __init__(self, env: TrackingEnv, *, num_threads: int, seed: int = 0) -> None:
-        assert isinstance(env.physics, CpuPhysics)
-        self.env, self.physics = env, env.physics
-        model = self.physics.scene(0).model
-        self.bare = Batch(model, nsim=env.num_envs, nthread=num_threads)
-        self.ctrl = self.bare.bind("ctrl")
-        # Derived fields that are bound are copied out; the environment binds these.
-        self.sensordata = self.bare.bind("sensordata")
-        self.generator = torch.Generator().manual_seed(seed)
-        self.td = env.reset()
-
-    def run(self) -> Segment:
-        """One segment of each, from equal states."""
-        self._follow()
-        actions = self._draw()
-        controls, spent = [], 0.0
-        for action in actions:
-            start = time.perf_counter()
-            self.td = self._env_step(action)
-            spent += time.perf_counter() - start
-            controls.append(np.array(self.physics.batch.bind("ctrl")))
-        start = time.perf_counter()
-        for ctrl in controls:
-            self.ctrl[:] = ctrl
-            self.bare.step(nstep=self.physics.decimation)
-        return Segment(spent, time.perf_counter() - start)
-
-    def _follow(self) -> None:
-        envs = range(self.env.num_envs)
-        self.bare.set_models([self.physics.scene(e).model for e in envs])
-        for name in STATE:
-            self.bare.bind(name)[:] = self.physics.batch.bind(name)
-
-    def _draw(self) -> torch.Tensor:
-        shape = (SEGMENT, 2, self.env.num_envs, self.env.bank.num_joints)
-        return 2 * torch.rand(shape, generator=self.generator) - 1
-
-    def _env_step(self, action: torch.Tensor) -> TensorDictBase:
-        for side, value in zip(keys.SIDES, action, strict=True):
-            self.td.set(keys.action(side), value)
-        return self.env.step_and_maybe_reset(self.td)[1]
-
-
-def measure(env: TrackingEnv, *, num_threads: int, seconds: float) -> dict[str, Any]:
-    """Let both take turns for some seconds.
-
-    Args:
-        env: environment on the cpu engine.
-        num_threads: threads of the engine, 0 for all cores.
-        seconds: how long to measure, burn-in excluded.
-
-    Returns:
-        env_steps_per_s, physics_env_steps_per_s, ratio (medians over segments) and
-        the number of segments.
-    """
-    duel = Duel(env, num_threads=num_threads)
-    for _ in range(BURN_IN):
-        duel.run()
-    segments: list[Segment] = []
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end or len(segments) < 3:
-        segments.append(duel.run())
-    steps = SEGMENT * env.num_envs
-    return {
-        "env_steps_per_s": round(steps / median(s.env for s in segments), 1),
-        "physics_env_steps_per_s": round(
-            steps / median(s.physics for s in segments), 1
-        ),
-        "ratio": round(median(s.physics / s.env for s in segments), 4),
-        "segments": len(segments),
-    }
+from flashdex.training.setup import Workbench, open_workbench
 
 
 def main(words: list[str] | None = None) -> dict[str, Any]:
     """Measure, and print one JSON object.
 
     Args:
-        words: ``--recipe NAME``, ``--num-envs N``, ``--seconds S``, and ``key=value``
-            overrides of the recipe.
+        words: ``--recipe NAME``, ``--num-envs N``, ``--seconds S``, ``--objects 1|2``,
+            ``--hulls N``, ``--out FILE``, and ``key=value`` overrides of the recipe
+            (``physics=warp`` chooses the engine).
 
     Returns:
         The printed object.
     """
     args = _parse(words or [])
-    overrides = list(args.overrides)
-    if args.num_envs is not None:
-        overrides.append(f"env.num_envs={args.num_envs}")
-    recipe = expect_kind(compose(args.recipe, overrides), Recipe, where="bench env")
-    env = open_workbench(recipe).make_env()
-    threads = recipe.physics.num_threads
+    recipe = compose_bench(args, where="bench env")
+    bench = open_workbench(recipe)
+    begin = time.perf_counter()
+    env = bench.make_env()
+    made = time.perf_counter() - begin
+    found = _measure(env, recipe, seconds=args.seconds)
     result = {
         "benchmark": "env",
-        "recipe": recipe.name,
-        "num_envs": env.num_envs,
-        "decimation": recipe.physics.decimation,
-        **measure(env, num_threads=threads, seconds=args.seconds),
+        **describe_bench(bench, env),
+        **found,
+        "build_s": round(made, 2),
+        "overflow": env.physics.take_overflow(),
+        **turns.room_used(env),
+        "memory_gb": memory_gb(env.device),
         "torch_threads": torch.get_num_threads(),
-        "hardware": describe_hardware(),
-        "commit": describe_commit(),
     }
-    sys.stdout.write(json.dumps(result) + "\n")
-    return result
+    return emit(result, out=args.out)
+
+
+def _measure(env: TrackingEnv, recipe: Recipe, *, seconds: float) -> dict[str, Any]:
+    if isinstance(env.physics, CpuPhysics):
+        threads = recipe.physics.num_threads
+        return duel.measure(env, num_threads=threads, seconds=seconds)
+    return turns.measure(env, seconds=seconds)
+
+
+def describe_bench(bench: Workbench, env: TrackingEnv) -> dict[str, Any]:
+    """What was measured: recipe, engine, device, worlds and scene.
+
+    Args:
+        bench: of the recipe.
+        env: its environment.
+    """
+    return {
+        "recipe": bench.recipe.name,
+        "engine": bench.recipe.physics.engine,
+        "device": str(env.device),
+        "num_envs": env.num_envs,
+        "decimation": bench.recipe.physics.decimation,
+        **describe_scene(bench.library),
+    }
+
+
+def add_recipe_options(parser: argparse.ArgumentParser, *, recipe: str) -> None:
+    """Add the options that choose recipe, worlds and scene.
+
+    Args:
+        parser: of the benchmark.
+        recipe: name of the recipe when none is given.
+    """
+    parser.add_argument("--recipe", default=recipe, help="name or path (%(default)s)")
+    parser.add_argument("--num-envs", type=int, help="worlds; the recipe's if absent")
+    parser.add_argument(
+        "--objects", type=int, help="made-up motions of 1 or 2 objects; --hulls too"
+    )
+    parser.add_argument(
+        "--hulls", type=int, help="convex parts of each made-up object, 1 to 16"
+    )
+    parser.add_argument(
+        "--libraries", type=Path, help="folder of the made-up libraries (the cache)"
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key=value")
+    add_output_options(parser)
+
+
+def compose_bench(
+    args: argparse.Namespace, *, where: str, changes: tuple[str, ...] = ()
+) -> Recipe:
+    """The recipe that the options ask for.
+
+    Args:
+        args: of a parser with the recipe options.
+        where: command, for messages.
+        changes: overrides that stand before those of the command line.
+    """
+    overrides = list(changes)
+    if args.num_envs is not None:
+        overrides.append(f"env.num_envs={args.num_envs}")
+    if args.objects is not None or args.hulls is not None:
+        objects, hulls = args.objects or 2, args.hulls or 1
+        path = bench_library(objects, hulls, folder=args.libraries)
+        overrides += [
+            f"motions.library={path.resolve()}",
+            "motions.count=null",
+            "motions.select=null",
+        ]
+    composed = compose(args.recipe, overrides + list(args.overrides))
+    return expect_kind(composed, Recipe, where=where)
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="flashdex bench env")
-    parser.add_argument("--recipe", default="quickstart", help="name or path")
-    parser.add_argument("--num-envs", type=int, help="worlds; the recipe's if absent")
+    add_recipe_options(parser, recipe="quickstart")
     parser.add_argument("--seconds", type=float, default=10.0, help="how long")
-    parser.add_argument("--json", action="store_true", help="always so")
-    parser.add_argument("overrides", nargs="*", metavar="key=value")
     return parser.parse_intermixed_args(words)

@@ -10,7 +10,6 @@ import torch
 
 from flashdex import keys
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.envs.transforms.base import assemble
 from flashdex.recipe import Recipe, compose, expect_kind
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.setup import open_workbench
@@ -83,10 +82,9 @@ def _one_update(learner: FlashSACLearner) -> dict[str, float]:
         call()
         times[phase] = time.perf_counter() - start
 
-    rows = learner.config.batch_size
-    state, _ = learner.codec.unpack(learner.buffer.sample(rows))
-    clock("sample", lambda: learner.codec.unpack(learner.buffer.sample(rows)))
-    clock("assemble", lambda: assemble(learner.sample_transforms, state))
+    state, _ = learner.codec.unpack(learner.buffer.draw())
+    clock("sample", lambda: learner.codec.unpack(learner.buffer.draw()))
+    clock("assemble", lambda: learner.show_rows(state))
     clock("whole", learner.update)
     times["learn"] = times["whole"] - times["sample"] - times["assemble"]
     return times

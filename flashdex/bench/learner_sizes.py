@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from tensordict import TensorDict
@@ -62,6 +62,8 @@ SIZES = {
     "quickstart": LearnerSize(
         582, 18, 2, 128, 64, 64, 78, 32, (32, 32, 16), threads=1, rounds=40
     ),
+    # only to try the commands
+    "tiny": LearnerSize(60, 18, 2, 64, 32, 16, 78, 16, (16, 16, 8), threads=1),
     # the paper's recipe: minutes an update on a CPU
     "paper": LearnerSize(900, 18, 2, 4096, 1024, 128, 78, rounds=1),
 }
@@ -105,8 +107,21 @@ def make_loss(size: LearnerSize) -> FlashSACLoss:
     )
 
 
-def make_plain(size: LearnerSize, loss: FlashSACLoss) -> PlainLearner:
-    """The plain learner with the weights of ``loss``."""
+def make_plain(
+    size: LearnerSize, loss: FlashSACLoss, *, device: torch.device | str = "cpu"
+) -> PlainLearner:
+    """The plain learner with the weights of ``loss``.
+
+    Args:
+        size: shapes.
+        loss: the library's learner.
+        device: where its tensors are made.
+    """
+    with torch.device(device):
+        return _make_plain(size, loss)
+
+
+def _make_plain(size: LearnerSize, loss: FlashSACLoss) -> PlainLearner:
     latent = size.latent if size.future else 0
     inputs = size.observation + latent
 
@@ -200,3 +215,15 @@ def make_batch(size: LearnerSize, *, seed: int = 0) -> tuple[TensorDict, PlainBa
         terminated=terminated.squeeze(-1).to(now.dtype),
     )
     return td, plain
+
+
+def move_batch(batch: PlainBatch, device: torch.device) -> PlainBatch:
+    """The batch on another device."""
+
+    def move(value: Tensor | list[Tensor] | None) -> Tensor | list[Tensor] | None:
+        if isinstance(value, list):
+            return [v.to(device) for v in value]
+        return None if value is None else value.to(device)
+
+    values = {f.name: move(getattr(batch, f.name)) for f in fields(batch)}
+    return PlainBatch(**values)  # pyright: ignore[reportArgumentType]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,9 +9,11 @@ from statistics import median
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import ProfilerActivity, profile
 
+from flashdex.bench.clock import now
 from flashdex.modules.product import multiply
 
 # operand positions of the products among the inputs of each operator
@@ -74,22 +75,37 @@ def _read(event: FunctionEvent) -> Product:
     return Product(members, left[-2], left[-1], columns)
 
 
-def replay_seconds(counts: dict[Product, float], *, repeat: int) -> float:
+def replay_seconds(
+    counts: dict[Product, float],
+    *,
+    repeat: int,
+    device: torch.device | str = "cpu",
+) -> float:
     """Seconds that the products of one call take by themselves, each in a tight loop.
 
     Args:
         counts: the products.
-        repeat: runs of each product; the median counts.
+        repeat: runs of each product; the median counts. On a GPU they run in one row,
+            and the mean counts.
+        device: where.
     """
-    total = 0.0
+    device, total = torch.device(device), 0.0
     for product, count in counts.items():
-        left = torch.randn(product.members, product.rows, product.inner)
-        right = torch.randn(product.members, product.columns, product.inner)
-        times = []
-        multiply(left, right)
-        for _ in range(repeat):
-            start = time.perf_counter()
-            multiply(left, right)
-            times.append(time.perf_counter() - start)
-        total += count * median(times)
+        left = torch.randn(product.members, product.rows, product.inner, device=device)
+        right = torch.randn(
+            product.members, product.columns, product.inner, device=device
+        )
+        total += count * _seconds_of(left, right, repeat=repeat)
     return total
+
+
+def _seconds_of(left: Tensor, right: Tensor, *, repeat: int) -> float:
+    device, times = left.device, []
+    in_a_row = 1 if device.type == "cpu" else 10 * repeat
+    multiply(left, right)
+    for _ in range(repeat if in_a_row == 1 else 1):
+        start = now(device)
+        for _ in range(in_a_row):
+            multiply(left, right)
+        times.append((now(device) - start) / in_a_row)
+    return median(times)

@@ -19,6 +19,7 @@ from flashdex.envs.physics.base import Physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.reset import ResetDraw, draw_reset, reset_state
 from flashdex.envs.samplers import SAMPLERS, UnconvertedSampler
+from flashdex.envs.scoring import Scoring
 from flashdex.envs.specs import action_spec, done_spec, reward_spec, state_spec
 from flashdex.envs.threads import few_threads
 from flashdex.envs.wrench import ObjectWrench, hold_share
@@ -81,6 +82,7 @@ class TrackingEnv(EnvBase):
             lead_s=self.lead_s,
             evaluation=evaluation,
         )
+        self._score = Scoring(self.judge, self.kinematics, compile=config.compile)
         self.sampler = SAMPLERS[config.sampler](bank.num_motions, device=device)
         self.attempt_sampler = UnconvertedSampler(bank.num_motions, device=device)
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
@@ -220,9 +222,8 @@ class TrackingEnv(EnvBase):
         self._act(action, ref)
         state = self.physics.state()
         self.steps = self.steps + 1
-        kin = self.kinematics(state[keys.JOINT_POS], state[keys.JOINT_VEL])
-        outcome = self.judge(
-            state, kin, ref, action, self._target, self.motion, self.steps
+        outcome, self._contact = self._score(
+            state, action, ref, self._target, self.motion, self.steps
         )
         scored = self.frame
         self.info = StepInfo(outcome, scored, self.motion)
@@ -230,7 +231,6 @@ class TrackingEnv(EnvBase):
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
         self.frame = scored + 1
-        self._contact = contact_code(state[keys.CONTACT], kin)
         out = self._observation(state)
         for i, side in enumerate(keys.SIDES):
             out[keys.reward(side)] = outcome.reward[:, i : i + 1]

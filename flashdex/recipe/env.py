@@ -187,6 +187,9 @@ class AssistConfig:
 class EnvConfig:
     """The tracking environment."""
 
+    compile: bool = False
+    """Compile the judging of a step: a minute or more at the start, then few kernels
+    instead of hundreds, which is what a GPU wants."""
     num_envs: int = number(2048, low=1)
     """Worlds simulated side by side."""
     finger_mode: Literal["absolute", "residual"] = "absolute"

@@ -1,0 +1,211 @@
+"""``flashdex bench train``: the whole training loop, and its parts alone.
+
+Physics alone and updates alone are measured in the same process before and after the
+loop, so that the loop's figures are shares of what was possible at that moment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from flashdex.allocator import keep_freed_memory
+from flashdex.bench.clock import memory_gb, now, reset_peak_memory
+from flashdex.bench.env import add_recipe_options, compose_bench, describe_bench
+from flashdex.bench.output import emit
+from flashdex.bench.turns import physics_rate, room_used
+from flashdex.recipe import Recipe
+from flashdex.training.assemble import BASELINES, make_trainer
+from flashdex.training.loop import Trainer
+from flashdex.training.setup import open_workbench
+
+WARM_UPDATES = 8  # an even number, so that the actor stepped too
+# No certificates, films or checkpoints, an actor that steps from the start, and a loop
+# that learns from the first batches on.
+CHANGES = (
+    "train.certify=false",
+    "train.render_conversions=false",
+    "train.checkpoint_replay=false",
+    "train.stop_when_all_converted=false",
+    "algo.actor_delay=0",
+)
+
+
+def main(words: list[str] | None = None) -> dict[str, Any]:
+    """Measure, and print one JSON object.
+
+    Args:
+        words: ``--seconds S``, ``--ceiling-seconds S``, the recipe's options and
+            ``key=value`` overrides.
+
+    Returns:
+        The printed object.
+    """
+    args = _parse(words or [])
+    recipe = _compose(args)
+    keep_freed_memory()
+    if recipe.train.torch_threads:
+        torch.set_num_threads(recipe.train.torch_threads)
+    found = measure(recipe, seconds=args.seconds, ceiling_seconds=args.ceiling_seconds)
+    return emit(found, out=args.out)
+
+
+def _compose(args: argparse.Namespace) -> Recipe:
+    """The recipe, learning from the first few batches of rows on."""
+    first = compose_bench(
+        args, where="bench train", changes=(*CHANGES, "algo.min_buffer=1")
+    )
+    rows = max(2 * first.algo.batch_size, 4 * first.env.num_envs)
+    least = f"algo.min_buffer={min(rows, first.algo.buffer_size)}"
+    return compose_bench(args, where="bench train", changes=(*CHANGES, least))
+
+
+def measure(
+    recipe: Recipe, *, seconds: float, ceiling_seconds: float
+) -> dict[str, Any]:
+    """Build a trainer as a run does and drive its vector step.
+
+    Args:
+        recipe: of an off-policy learner.
+        seconds: of the loop.
+        ceiling_seconds: of each part alone, before and after.
+
+    Returns:
+        Rates, milliseconds of the phases, shares of the ceilings, memory.
+    """
+    with _open_trainer(recipe) as (trainer, described, built):
+        device = trainer.learner.device
+        reset_peak_memory(device)
+        td, warm = _warm_up(trainer)
+        before = _ceilings(trainer, seconds=ceiling_seconds)
+        td = _restart(trainer)
+        loop = _loop(trainer, td, seconds=seconds)
+        after = _ceilings(trainer, seconds=ceiling_seconds)
+        memory = memory_gb(device)
+        overflow = trainer.env.physics.take_overflow()
+        room, rows = room_used(trainer.env), trainer.learner.num_rows
+    physics, learner = (0.5 * (a + b) for a, b in zip(before, after, strict=True))
+    rate, updates = loop["env_steps_per_s"], loop["updates_per_s"]
+    worlds = recipe.env.num_envs
+    alone = worlds / physics + recipe.algo.updates_per_step / learner
+    return {
+        "benchmark": "train",
+        **described,
+        "batch": recipe.algo.batch_size,
+        "critic": recipe.algo.critic_width,
+        "updates_per_step": recipe.algo.updates_per_step,
+        "bfloat16": recipe.algo.bfloat16,
+        "compile": recipe.algo.compile,
+        "replay": recipe.algo.replay,
+        **loop,
+        "ceiling_physics_env_steps_per_s": round(physics, 1),
+        "ceiling_updates_per_s": round(learner, 2),
+        "ceilings_before_after": [
+            [round(x, 2) for x in pair] for pair in (before, after)
+        ],
+        "share_of_physics": round(rate / physics, 4),
+        "share_of_learner": round(updates / learner, 4),
+        # physics and updates one after the other, and nothing else
+        "share_of_both": round(rate * alone / worlds, 4),
+        "build_s": round(built, 2),
+        "warm_up_s": round(warm, 2),
+        "rows": rows,
+        "overflow": overflow,
+        **room,
+        "memory_gb": memory,
+        "torch_threads": torch.get_num_threads(),
+    }
+
+
+@contextmanager
+def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], float]]:
+    """A trainer in a temporary run folder, what it is, and the seconds it took."""
+    begin = now(torch.device("cpu"))
+    bench = open_workbench(recipe)
+    with tempfile.TemporaryDirectory(prefix="flashdex-bench-") as folder:
+        # the baselines are scores of the collection, no part of the loop
+        (Path(folder) / BASELINES).write_text("{}", encoding="utf-8")
+        torch.manual_seed(recipe.seed)
+        trainer = make_trainer(bench, Path(folder), None, [])
+        described = describe_bench(bench, trainer.env)
+        try:
+            with trainer.guard:
+                yield trainer, described, now(torch.device("cpu")) - begin
+        finally:
+            trainer.alongside.close()
+            trainer.judging.close(wait=False)
+            trainer.log.close()
+
+
+def _warm_up(trainer: Trainer) -> tuple[TensorDictBase, float]:
+    """Vector steps until some updates are done: kernels, compilation, buffers."""
+    begin = now(trainer.learner.device)
+    td = _restart(trainer)
+    while trainer.learner.updates < WARM_UPDATES:
+        td = trainer.vector_step(td)
+    return td, now(trainer.learner.device) - begin
+
+
+def _restart(trainer: Trainer) -> TensorDictBase:
+    """New episodes everywhere, as after a resume."""
+    forget = getattr(trainer.learner, "forget_episodes", None)
+    if forget is not None:
+        forget()
+    td = trainer.env.reset()
+    trainer.attempts.begin()
+    return td
+
+
+def _ceilings(trainer: Trainer, *, seconds: float) -> tuple[float, float]:
+    """Env steps a second of the physics alone, updates of the learner alone."""
+    physics = physics_rate(trainer.env, seconds=seconds)
+    learner = trainer.learner
+    updates = learner.updates
+    begin = end = now(learner.device)
+    while end - begin < seconds or learner.updates < updates + 2:
+        for _ in range(8):
+            for _ in range(learner.due()):  # as the loop asks: samples come together
+                learner.update()
+        end = now(learner.device)
+    return physics, (learner.updates - updates) / (end - begin)
+
+
+def _loop(trainer: Trainer, td: TensorDictBase, *, seconds: float) -> dict[str, Any]:
+    """Drive the loop; the device is waited for at the end of a block of steps."""
+    device, worlds = trainer.learner.device, trainer.env.num_envs
+    trainer.stats.pop(1.0, worlds)
+    steps, updates = trainer.env_steps, trainer.learner.updates
+    begin = end = now(device)
+    block = 1
+    while end - begin < seconds:
+        for _ in range(block):
+            td = trainer.vector_step(td)
+        end = now(device)
+        block = min(2 * block, 64)
+    spent = end - begin
+    phases = trainer.stats.pop(spent, worlds)
+    names = [name for name in phases if name.startswith("perf/ms_")]
+    return {
+        "env_steps_per_s": round((trainer.env_steps - steps) / spent, 1),
+        "updates_per_s": round((trainer.learner.updates - updates) / spent, 3),
+        "seconds": round(spent, 2),
+        "vector_steps": (trainer.env_steps - steps) // worlds,
+        "ms_by_phase": {n.removeprefix("perf/ms_"): round(phases[n], 3) for n in names},
+    }
+
+
+def _parse(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="flashdex bench train")
+    add_recipe_options(parser, recipe="quickstart")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of the loop")
+    parser.add_argument(
+        "--ceiling-seconds", type=float, default=4.0, help="of each part alone"
+    )
+    return parser.parse_intermixed_args(words)

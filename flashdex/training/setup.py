@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.make import engine_device, make_physics
+from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
@@ -201,5 +201,8 @@ def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Wor
             f"physics.decimation={round(1 / (library.fps * recipe.physics.timestep))} "
             f"or prepare with --hz {1 / step_dt:g}."
         )
-    bank = ReferenceBank(library, hands).to(device or engine_device(recipe.physics))
+    if device is None:  # else somebody who steps no physics
+        check_engine(library, recipe.physics)
+        device = engine_device(recipe.physics)
+    bank = ReferenceBank(library, hands).to(device)
     return Workbench(recipe, library, hands, bank)

@@ -15,17 +15,44 @@ from flashdex.motions.library import MotionLibrary
 if TYPE_CHECKING:
     from flashdex.recipe import PhysicsConfig
 
-_CPU = torch.device("cpu")
-
 
 def engine_device(physics: PhysicsConfig) -> torch.device:
-    """Where the engine's states live: the GPU for warp and brax, where there is one.
+    """Where the engine's states live: warp and brax use a GPU where they see one.
 
     Args:
         physics: engine settings of the recipe.
+
+    Raises:
+        FlashdexError: its packages are missing.
     """
-    on_gpu = physics.engine != "cpu" and torch.cuda.is_available()
-    return torch.device("cuda", torch.cuda.current_device()) if on_gpu else _CPU
+    match physics.engine:
+        case "warp":
+            from flashdex.envs.physics.warp_model import warp_device
+
+            return warp_device()
+        case "brax":
+            from flashdex.envs.physics.brax import brax_device
+
+            return brax_device()
+        case _:
+            return torch.device("cpu")
+
+
+def check_engine(library: MotionLibrary, physics: PhysicsConfig) -> None:
+    """Refuse what an engine cannot run, before anything is built.
+
+    Args:
+        library: the prepared collection.
+        physics: engine settings of the recipe.
+
+    Raises:
+        FlashdexError: packages are missing, or the collection is not for this engine.
+    """
+    engine_device(physics)
+    if physics.engine == "brax":
+        from flashdex.envs.physics.brax import refuse_unlike_objects
+
+        refuse_unlike_objects(library)
 
 
 def make_physics(

@@ -17,6 +17,7 @@ from flashdex.envs.physics.warp_model import (
     model_fields,
     require_warp,
     room_of,
+    warp_device,
 )
 from flashdex.envs.physics.warp_wrench import WrenchInput
 from flashdex.envs.scene import Scene, build_scenes
@@ -27,12 +28,6 @@ from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
     from flashdex.recipe import PhysicsConfig
-
-
-def _device() -> torch.device:
-    if not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device("cuda", torch.cuda.current_device())
 
 
 def _kinds(overflow: Any) -> dict[str, int]:
@@ -69,7 +64,7 @@ class WarpPhysics:
     ) -> None:
         wp = require_warp()[0]
         self.num_envs = num_envs
-        self.device = _device()
+        self.device = warp_device()
         self.decimation = physics.decimation
         self.step_dt = physics.timestep * physics.decimation
         self.scenes: list[Scene] = build_scenes(library, hands, physics)

@@ -38,6 +38,18 @@ def require_warp() -> tuple[Any, Any]:
     return wp, mjw
 
 
+def warp_device() -> torch.device:
+    """The CUDA device that torch uses, without one the CPU.
+
+    Raises:
+        MissingExtraError: warp is not installed.
+    """
+    require_warp()
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", torch.cuda.current_device())
+
+
 def model_fields() -> dict[str, bool]:
     """Names of the model's arrays that mujoco_warp reads, and whether per world."""
     mjw = require_warp()[1]

@@ -1,0 +1,127 @@
+"""Judging in a process beside the loop: the same lines, and no silent death."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import pytest
+import torch
+
+from flashdex import keys
+from flashdex.errors import RunError
+from flashdex.recipe import MotionsConfig
+from flashdex.training.assemble import start_judge
+from flashdex.training.attempt_ring import AttemptRing
+from flashdex.training.attempts import versions
+from flashdex.training.jsonl import read_lines
+from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder
+from flashdex.training.ledger import CONVERSIONS, Ledger
+
+
+def die(order):
+    os._exit(7)
+
+
+def cannot_write(order):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.fixture
+def bench(make_bench, library):
+    bench = make_bench(6, attempt_share=1.0, finger_mode="residual")
+    motions = MotionsConfig(library=str(library.path))
+    recipe = dataclasses.replace(bench.recipe, motions=motions)
+    return dataclasses.replace(bench, recipe=recipe)
+
+
+@pytest.fixture
+def episodes(bench):
+    """Finished episodes of shaky hands, and the scenes they took place in."""
+    env = bench.make_env()
+    ring, found = AttemptRing(env), []
+    generator = torch.Generator().manual_seed(0)
+    td = env.reset()
+    ring.begin()
+    for step in range(90):
+        action = 0.4 * (2 * torch.rand(6, 2, 18, generator=generator) - 1)
+        env.put_action(td, action)
+        done = env.step(td)["next", keys.DONE]
+        found += ring.step(action, done, step)
+        td = env.restart(done.squeeze(-1))
+        ring.begin()
+    assert len(found) > 6
+    return found, env.physics.scenes
+
+
+def make_ledger(bench, folder):
+    recipe = bench.recipe
+    return Ledger(
+        folder,
+        bench.bank.names,
+        criterion=recipe.train.criterion,
+        seed=recipe.seed,
+        engine="cpu",
+    )
+
+
+def beside(bench, folder, start=start_judge):
+    order = JudgeOrder(bench.recipe, folder, versions(), {"date": "today"}, {})
+    return JudgeBeside(make_ledger(bench, folder), order, start)
+
+
+def test_both_ways_write_the_same_lines(bench, episodes, tmp_path):
+    found, scenes = episodes
+    maker = bench.attempt_maker(
+        scenes, made_by=versions(), provenance={"date": "today"}
+    )
+    here = JudgeHere(make_ledger(bench, tmp_path / "here"), maker)
+    there = beside(bench, tmp_path / "there")
+    conversions = [[], []]
+    for number, episode in enumerate(found):
+        for judging, list_ in zip((here, there), conversions, strict=True):
+            judging.submit(episode, 0.5 * number)
+            list_ += judging.collect()
+    conversions[1] += there.collect(wait=True)
+    assert there.pending == 0
+    there.close()
+    lines = [read_lines(tmp_path / name / CONVERSIONS) for name in ("here", "there")]
+    lines = [list(x) for x in lines]
+    assert lines[0] == lines[1]
+    assert len(lines[0]) == len(found)
+    assert [c.motion for c in conversions[0]] == [c.motion for c in conversions[1]]
+    assert here.ledger.metrics(1.0) == there.ledger.metrics(1.0)
+    assert here.ledger.num_bytes == there.ledger.num_bytes
+
+
+def test_a_process_that_dies_is_noticed(bench, episodes, tmp_path):
+    judging = beside(bench, tmp_path, die)
+    judging.submit(episodes[0][0], 1.0)
+    with pytest.raises(RunError, match=r"died \(exit code 7\) with 1 of them"):
+        judging.collect(wait=True)
+    judging.close(wait=False)
+    assert not judging._process.is_alive()
+
+
+def test_an_error_of_the_process_is_that_of_the_loop(bench, episodes, tmp_path):
+    judging = beside(bench, tmp_path, cannot_write)
+    judging.submit(episodes[0][0], 1.0)
+    with pytest.raises(OSError, match="No space left"):
+        judging.collect(wait=True)
+    judging.close(wait=False)
+
+
+def test_a_run_judged_beside_the_loop_begins_alike(start_tiny, tmp_path):
+    runs = {}
+    for way in ("inline", "process"):
+        start_tiny(tmp_path / way, train={"judge": way})
+        lines = read_lines(tmp_path / way / CONVERSIONS)
+        runs[way] = [{k: v for k, v in x.items() if k != "wall_s"} for x in lines]
+    # What converts is drawn less often, a little later when the verdict comes later.
+    first = [x["converted"] for x in runs["inline"]].index(True) + 1
+    assert runs["inline"][:first] == runs["process"][:first]
+    assert all(
+        (tmp_path / "process" / x["rollout"]).is_file()
+        for x in runs["process"]
+        if x.get("rollout")
+    )

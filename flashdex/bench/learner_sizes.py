@@ -65,7 +65,7 @@ SIZES = {
     # only to try the commands
     "tiny": LearnerSize(60, 18, 2, 64, 32, 16, 78, 16, (16, 16, 8), threads=1),
     # the paper's recipe: minutes an update on a CPU
-    "paper": LearnerSize(900, 18, 2, 4096, 1024, 128, 78, rounds=1),
+    "paper": LearnerSize(2308, 18, 2, 4096, 1024, 128, 78, rounds=1),
 }
 
 

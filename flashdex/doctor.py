@@ -82,9 +82,10 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     from flashdex.training.memory import plan_memory
     from flashdex.training.memory_text import format_cards, format_plan, format_work
     from flashdex.training.run import default_run_dir
+    from flashdex.training.setup import learner_device
 
     recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")
-    on_gpu = recipe.physics.engine != "cpu"
+    on_gpu = recipe.physics.engine != "cpu" or learner_device(recipe).type == "cuda"
     plan = plan_memory(
         recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
     )

@@ -41,6 +41,23 @@ def bfloat16_products(enabled: bool = True) -> Iterator[None]:
         _state.lowered = before
 
 
+@contextmanager
+def tf32_products(enabled: bool = True) -> Iterator[None]:
+    """Compute float32 products of a GPU in TF32 inside, and those after it as before.
+
+    Small products elsewhere, rotations of rewards and observations, keep all digits.
+
+    Args:
+        enabled: False changes nothing.
+    """
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if enabled else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 @torch.compiler.assume_constant_result
 def are_bfloat16() -> bool:
     """Whether `bfloat16_products` is on in this thread."""

@@ -257,6 +257,8 @@ class PPO:
         self.policy.load_state_dict(state["policy"])
         self.value.load_state_dict(state["value"])
         self.optimizer.load_state_dict(state["optimizer"])
+        # Adam leaves the rate on the device it was stored from.
+        group = self.optimizer.param_groups[0]
+        group["lr"] = group["lr"].to(self.policy.log_std.device)
         if state["lr"] != self.lr:
-            group = self.optimizer.param_groups[0]
             group["lr"] = torch.full_like(self.rate, self.lr)

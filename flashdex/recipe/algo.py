@@ -56,7 +56,7 @@ class AlgoConfig:
     """Transitions kept; about 1 kB each."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the networks learn and the replay rows may lie; auto = a GPU where there is
-    one, whichever engine steps the physics."""
+    one, whichever engine steps the physics. A gym recipe learns on the CPU."""
     replay: Literal["auto", "device", "pinned", "cpu"] = "auto"
     """Where they are kept. auto and device: on the learner's device, the fastest.
     pinned: in host memory beside a CUDA device that cannot hold them, exchanged through

@@ -14,6 +14,7 @@ from flashdex.modules.exploration import NoiseRepetition
 from flashdex.modules.future import FutureEncoder
 from flashdex.modules.layers import warm_up_statistics
 from flashdex.modules.policy import FlashPolicy
+from flashdex.modules.product import tf32_products
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.objectives.stepper import FlashSACStepper
@@ -97,7 +98,8 @@ class FlashSACAgent:
 
     def update(self, batch: TensorDictBase) -> TensorDict:
         """One FlashSAC update on a sampled batch; returns its metrics."""
-        return self.stepper.update(batch)
+        with tf32_products(self.config.tf32 and self.device.type == "cuda"):
+            return self.stepper.update(batch)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, normaliser, generator and noise clock."""

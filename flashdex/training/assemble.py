@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from flashdex.envs.physics.make import engine_device
 from flashdex.envs.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
@@ -63,7 +62,8 @@ def make_trainer(
         (run_dir / BASELINES).unlink(missing_ok=True)  # other physics, other scores
     baselines = score_baselines(bench, run_dir / BASELINES)
     trivial = baselines.trivial(recipe.train.criterion)
-    ledger = _open_ledger(bench, run_dir, trivial)
+    on_gpu = env.device.type == "cuda"
+    ledger = _open_ledger(bench, run_dir, trivial, on_gpu=on_gpu)
     start = begin_session(
         run_dir,
         env_steps=state["env_steps"] if state else 0,
@@ -95,7 +95,9 @@ def make_trainer(
     return trainer
 
 
-def _open_ledger(bench: Workbench, run_dir: Path, trivial: Trivial) -> Ledger:
+def _open_ledger(
+    bench: Workbench, run_dir: Path, trivial: Trivial, *, on_gpu: bool
+) -> Ledger:
     recipe = bench.recipe
     return Ledger(
         run_dir,
@@ -103,7 +105,7 @@ def _open_ledger(bench: Workbench, run_dir: Path, trivial: Trivial) -> Ledger:
         criterion=recipe.train.criterion,
         seed=recipe.seed,
         engine=recipe.physics.engine,
-        on_gpu=engine_device(recipe.physics).type == "cuda",
+        on_gpu=on_gpu,
         certify=recipe.train.certify,
         trivial=trivial,
     )
@@ -128,6 +130,7 @@ def _make_judging(
         made_by,
         provenance,
         ledger.trivial,
+        ledger.on_gpu,
     )
     return JudgeBeside(ledger, order, start_judge)
 
@@ -143,7 +146,8 @@ def start_judge(order: JudgeOrder) -> tuple[Ledger, AttemptMaker]:
     maker = bench.attempt_maker(
         scenes, made_by=order.made_by, provenance=order.provenance
     )
-    return _open_ledger(bench, order.run_dir, order.trivial), maker
+    ledger = _open_ledger(bench, order.run_dir, order.trivial, on_gpu=order.on_gpu)
+    return ledger, maker
 
 
 def _provenance(bench: Workbench) -> dict[str, str]:

@@ -119,7 +119,9 @@ class AttemptRing:
         values = values[: self.count]
         if name not in self._rings:
             shape = (self.count, self.size, *values.shape[1:])
-            self._rings[name] = values.new_zeros(shape)
+            self._rings[name] = torch.zeros(
+                shape, dtype=values.dtype, device=self.env.device
+            )
         self._rings[name][:, self.written % self.size] = values
 
     def _take(self, env: int, first: int, last: int, env_steps: int) -> Episode:

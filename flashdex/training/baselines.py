@@ -67,7 +67,7 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
     joints = bench.bank.num_joints
 
     def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
-        return torch.zeros(env.num_envs, 2, joints)
+        return torch.zeros(env.num_envs, 2, joints, device=env.device)
 
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     for name, target in BASELINES.items():
@@ -89,7 +89,8 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
 
 def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
     """``frozen_object``: objects stay at their first reference pose."""
-    bank, criterion = bench.bank, bench.recipe.train.criterion
+    bank = bench.bank_on(torch.device("cpu"))
+    criterion = bench.recipe.train.criterion
     out: dict[str, dict[str, Any]] = {}
     for row, name in enumerate(bank.names):
         frames = torch.arange(int(bank.length[row]))

@@ -57,7 +57,7 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> Evaluation:
     restore(learner, state)
 
     def act(td: TensorDictBase, env: TrackingEnv) -> Tensor:
-        return learner.act(td, explore=False)
+        return learner.act(td.to(learner.device), explore=False)
 
     criterion = recipe.train.criterion
     attempts = roll_all(bench, act, env_steps=state["env_steps"])

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from flashdex.allocator import keep_freed_memory
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.files import write_atomic
 from flashdex.recipe import GymRecipe, dump_recipe, expect_kind, load_recipe
 from flashdex.training.checkpoint import (
@@ -91,6 +91,11 @@ def make_gym_learner(recipe: GymRecipe) -> GymLearner:
     Raises:
         FlashdexError: the environment cannot be used.
     """
+    if recipe.algo.device == "cuda":
+        raise FlashdexError(
+            "algo.device: a gym recipe learns on the CPU, beside its environments. Use "
+            "algo.device=cpu or auto."
+        )
     keep_freed_memory()
     if recipe.train.torch_threads:
         torch.set_num_threads(recipe.train.torch_threads)

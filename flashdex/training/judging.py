@@ -9,12 +9,16 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing as mp
 import os
-import queue
+import signal
+import threading
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.training.attempt_ring import Episode
 from flashdex.training.attempts import AttemptMaker
 from flashdex.training.ledger import Conversion, Ledger
@@ -23,7 +27,6 @@ if TYPE_CHECKING:
     from flashdex.recipe import Recipe
 
 MAX_PENDING = 512  # episodes in line, a megabyte each; then the loop waits
-_ALIVE_S = 2.0  # how often each side looks whether the other still lives
 
 
 class Judging(Protocol):
@@ -105,6 +108,7 @@ class JudgeOrder:
         made_by: engine, versions and hardware of the states.
         provenance: stored with every rollout.
         trivial: motions that a baseline already passes.
+        on_gpu: a GPU steps the physics.
     """
 
     recipe: Recipe
@@ -112,6 +116,10 @@ class JudgeOrder:
     made_by: dict[str, Any]
     provenance: dict[str, str]
     trivial: dict[str, list[str]]
+    on_gpu: bool = False
+
+
+Start = Callable[[JudgeOrder], tuple[Ledger, AttemptMaker]]
 
 
 class JudgeBeside:
@@ -123,57 +131,51 @@ class JudgeBeside:
         start: what the process runs first, to build ledger and maker from the order.
     """
 
-    def __init__(
-        self,
-        ledger: Ledger,
-        order: JudgeOrder,
-        start: Callable[[JudgeOrder], tuple[Ledger, AttemptMaker]],
-    ) -> None:
+    def __init__(self, ledger: Ledger, order: JudgeOrder, start: Start) -> None:
         self.ledger = ledger
-        self.pending = 0
-        context = mp.get_context("spawn")  # a fork would share the GPU's state
-        self._tasks: Any = context.Queue()
-        self._answers: Any = context.Queue()
-        self._process = context.Process(
-            target=_judge,
-            args=(order, start, self._tasks, self._answers),
-            name="judge",
-            daemon=True,
+        # A fork would share the GPU's state. One process: lines keep their order.
+        self._pool = ProcessPoolExecutor(
+            1, mp_context=mp.get_context("spawn"), initializer=_begin
         )
-        self._process.start()
+        self._opened: Future[None] | None = self._pool.submit(_open, order, start)
+        self._line: deque[Future[dict[str, Any]]] = deque()
+
+    @property
+    def pending(self) -> int:
+        """Episodes that are not judged yet."""
+        return len(self._line)
 
     def submit(self, episode: Episode, wall_s: float) -> None:
         """See ``Judging.submit``."""
-        self._tasks.put((episode, wall_s))
-        self.pending += 1
+        try:
+            self._line.append(self._pool.submit(_judge, episode, wall_s))
+        except BrokenProcessPool as error:
+            raise self._died() from error
 
     def collect(self, *, wait: bool = False) -> list[Conversion]:
         """See ``Judging.collect``."""
         found = []
         enough = 0 if wait else MAX_PENDING
-        while self.pending:
+        while self._line and (len(self._line) > enough or self._line[0].done()):
             try:
-                patience = _ALIVE_S if self.pending > enough else 0.0
-                line = self._answers.get(patience > 0, patience)
-            except queue.Empty:
-                if not self._process.is_alive():
-                    raise self._died() from None
-                if self.pending > enough:
-                    continue
-                break
-            if isinstance(line, Exception):
-                raise line
-            self.pending -= 1
+                if self._opened is not None:
+                    self._opened.result()
+                    self._opened = None
+                line = self._line[0].result()
+            except BrokenProcessPool as error:
+                raise self._died() from error
+            self._line.popleft()
             if (conversion := self.ledger.take(line)) is not None:
                 found.append(conversion)
         return found
 
     def _died(self) -> RunError:
         return RunError(
-            f"the process that judges attempts has died (exit code "
-            f"{self._process.exitcode}) with {self.pending} of them in line; those are "
-            "lost. Was it killed for memory? Continue with 'flashdex train --resume "
-            f"{self.ledger.path.parent}', or judge in the loop with train.judge=inline."
+            f"the process that judges attempts has died with {self.pending} of them in "
+            "line; those are lost. Was it killed for memory? (A script of yours that "
+            "trains needs an 'if __name__ == \"__main__\":'.) Continue with 'flashdex "
+            f"train --resume {self.ledger.path.parent}', or judge in the loop with "
+            "train.judge=inline."
         )
 
     def close(self, *, wait: bool = True) -> None:
@@ -182,43 +184,41 @@ class JudgeBeside:
             if wait:
                 self.collect(wait=True)
         finally:
-            self._tasks.put(None)
-            self._process.join(_ALIVE_S if wait else 0.0)
-            if self._process.is_alive():
-                self._process.terminate()
+            self._pool.shutdown(wait=wait, cancel_futures=True)
 
 
-def _judge(
-    order: JudgeOrder,
-    start: Callable[[JudgeOrder], tuple[Ledger, AttemptMaker]],
-    tasks: Any,
-    answers: Any,
-) -> None:
-    """Body of the process: episodes in, lines out, until None or the parent's end."""
-    import signal
+_open_parts: list[tuple[Ledger, AttemptMaker]] = []  # of the judging process
 
+
+def _begin() -> None:
+    """First thing in the process: live and die with the loop."""
+    # A signal to the whole group ends the loop, which ends this in order.
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _follow_parent() -> None:
+    parent = mp.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)  # nobody waits for the rest
+
+
+def _open(order: JudgeOrder, start: Start) -> None:
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ends it in order
     torch.set_num_threads(1)
-    parent = os.getppid()
     try:
-        ledger, maker = start(order)
-        while (task := _next(tasks, parent)) is not None:
-            episode, wall_s = task
-            attempt = maker.make(episode)
-            ledger.record(attempt, env_steps=episode.env_steps, wall_s=wall_s)
-            answers.put(ledger.last_line)
-    except Exception as error:
-        answers.put(error)
-        raise
+        _open_parts.append(start(order))
+    except FlashdexError as error:
+        raise RunError(str(error)) from None  # others may not travel between processes
 
 
-def _next(tasks: Any, parent: int) -> tuple[Episode, float] | None:
-    """Wait for a task; None when there will be no more."""
-    while os.getppid() == parent:
-        try:
-            return tasks.get(timeout=_ALIVE_S)
-        except queue.Empty:
-            continue
-    return None
+def _judge(episode: Episode, wall_s: float) -> dict[str, Any]:
+    """Judge one episode; return its line, which is in the file."""
+    ledger, maker = _open_parts[0]
+    attempt = maker.make(episode)
+    ledger.record(attempt, env_steps=episode.env_steps, wall_s=wall_s)
+    return ledger.last_line

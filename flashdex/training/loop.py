@@ -15,7 +15,7 @@ from torchrl.envs.utils import step_mdp
 from flashdex import keys
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
-from flashdex.recipe import Recipe, dump_recipe
+from flashdex.recipe import Recipe
 from flashdex.training.alongside import Alongside
 from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempt_ring import AttemptRing, Episode
@@ -30,6 +30,7 @@ from flashdex.training.judging import Judging
 from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
+from flashdex.training.loop_state import load_loop_state, loop_state
 from flashdex.training.nan_dump import stop_with_dump
 from flashdex.training.progress import Progress
 from flashdex.training.record import make_record
@@ -80,7 +81,7 @@ class Trainer:
         self.alongside = Alongside(threaded=recipe.train.overlap and env.host_sees)
         self.stop = StopSignals()
         self.env_steps = start.env_steps
-        self._vector_steps = 0
+        self.vector_steps = 0
         self._saved_at = start.env_steps
         self._logged = (start.env_steps, ledger.num_attempts)
         self._last_record: dict[str, float] = {}
@@ -102,9 +103,8 @@ class Trainer:
         try:
             with self.stop, self.guard:
                 why = self._loop()
-                self._judge(self.attempts.look(), wait=True)
-                self._write_log()
                 self.save()
+                self._write_log()
         except NonFiniteError as error:
             raise self._dump(str(error)) from error
         except OSError as error:
@@ -150,16 +150,17 @@ class Trainer:
                 td = self.env.step(td)
             after = td.get("next")
             self.env_steps += self.env.num_envs
-            self._vector_steps += 1
+            self.vector_steps += 1
             terminated, done = after[keys.TERMINATED], after[keys.DONE]
-            self._judge(self.attempts.step(action, done, self.env_steps))
+            with self.stats.time("judge"):
+                self._judge(self.attempts.step(action, done, self.env_steps))
         with self.stats.time("remember"):
             self._remember(td, action)
         if not self.learner.is_off_policy:
             self._learn()
         judged = (self.env.last_outcome, done, terminated)
         self.stats.add_step(*judged)
-        self.assist_epoch.step(self.env, *judged, self._vector_steps)
+        self.assist_epoch.step(self.env, *judged, self.vector_steps)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
@@ -260,41 +261,24 @@ class Trainer:
         if self.env_steps == self._saved_at:
             return
         self.guard.check()
-        self._judge(self.attempts.look(), wait=True)  # the ledger says all, then
+        lost: RunError | None = None
+        try:
+            self._judge(self.attempts.look(), wait=True)  # the ledger says all, then
+        except RunError as error:
+            lost = error  # of the attempts in line; what was learnt is not
         state = self.state_dict()
         if bad := first_non_finite(state["learner"]):
             raise NonFiniteError(bad)
         keep = self.recipe.train.keep_checkpoints
         save_checkpoint(self.run_dir, state, keep=keep, replay=self.replay)
         self._saved_at = self.env_steps
+        if lost is not None:
+            raise lost
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a resumed run needs, tensors and plain values only.
-
-        The samplers hold nothing but what the conversions say, and those are in files.
-        """
-        assist = self.env.assist
-        return {
-            "env_steps": self.env_steps,
-            "vector_steps": self._vector_steps,
-            "wall_s": self.wall_s,
-            "env_steps_lost": self.start.lost,
-            "learner": self.learner.state_dict(),
-            "assist": None if assist is None else assist.state_dict(),
-            "assist_epoch": self.assist_epoch.state_dict(),
-            "env_generator": self.env.generator.get_state(),
-            "torch_rng": torch.get_rng_state(),
-            "ledger_bytes": self.ledger.num_bytes,
-            "recipe": dump_recipe(self.recipe),
-            "wandb_id": self.log.wandb_id,
-        }
+        """Everything a resumed run needs; see ``loop_state``."""
+        return loop_state(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore all of ``state_dict`` but the learner, which is restored already."""
-        self._vector_steps = state["vector_steps"]
-        self.assist_epoch.load_state_dict(state["assist_epoch"])
-        if self.env.assist is not None and state["assist"] is not None:
-            self.env.assist.load_state_dict(state["assist"])
-            self.env.redraw_assist()
-        self.env.load_generator(state["env_generator"])
-        torch.set_rng_state(state["torch_rng"])
+        load_loop_state(self, state)

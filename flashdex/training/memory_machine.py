@@ -10,6 +10,8 @@ from typing import Literal
 
 import torch
 
+from flashdex.training.checkpoint import FOLDER as CHECKPOINTS
+
 Pool = Literal["gpu", "host", "disk"]
 _MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
@@ -110,4 +112,9 @@ def _left_in(group: Path) -> int | None:
 def _free_disk(folder: Path) -> int | None:
     folder = folder.absolute()
     there = next((p for p in (folder, *folder.parents) if p.exists()), None)
-    return None if there is None else shutil.disk_usage(there).free
+    if there is None:
+        return None
+    # a run that goes on replaces the checkpoints that it has
+    own = folder / CHECKPOINTS
+    had = sum(p.stat().st_size for p in own.rglob("*") if p.is_file())
+    return shutil.disk_usage(there).free + had

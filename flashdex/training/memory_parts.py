@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
+import torch
 from mujoco.batch import Batch
 
 from flashdex.envs.physics.warp_memory import WarpMemory, measure_warp
@@ -30,6 +32,10 @@ from flashdex.training.memory_walk import tensor_bytes
 # Allowances: what no arithmetic gives. On the GPU the contexts of torch and warp, their
 # kernels and workspaces, and gaps between blocks; on the host the same libraries.
 GPU_ALLOWANCE, HOST_ALLOWANCE = 3 << 29, 1 << 30
+
+
+# Parts that do not depend on what a collection holds.
+CERTAIN = {"replay rows", "stored replay rows", "CUDA", "libraries"}
 
 
 @dataclass(frozen=True)
@@ -138,22 +144,36 @@ def list_parts(recipe: Recipe, sizes: PartSizes, *, device: Pool) -> list[Part]:
     unknown = not counts.known
     about = f"{counts.frames:,} frames of {counts.motions} motions"
     parts += [
-        Part("reference frames", device, frames, about, unknown),
+        Part("reference frames", device, frames, about),
         Part(
             "objects",
             device,
             objects,
             f"{counts.objects} x {counts.points} points, {counts.nodes}^3 distances",
-            unknown,
         ),
     ]
     if device == "gpu":
         copy = "for storing rollouts"
         whole = frames + objects
-        parts.append(Part("references on the host", "host", whole, copy, unknown))
+        parts.append(Part("references on the host", "host", whole, copy))
         parts.append(Part("CUDA", "gpu", GPU_ALLOWANCE, "allowance, not computed"))
     parts.append(Part("libraries", "host", HOST_ALLOWANCE, "allowance, not computed"))
-    return [*parts, *_disk(recipe, sizes)]
+    parts += _disk(recipe, sizes)
+    return [
+        dataclasses.replace(p, assumed=unknown and p.name not in CERTAIN) for p in parts
+    ]
+
+
+def engine_pool(recipe: Recipe, device: Pool) -> Pool:
+    """Where the physics is: a GPU engine takes a GPU also beside a learner on the host.
+
+    Args:
+        recipe: its engine.
+        device: where the learner lives.
+    """
+    if recipe.physics.engine == "cpu":
+        return "host"
+    return "gpu" if torch.cuda.is_available() else device
 
 
 def _learner(recipe: Recipe, sizes: PartSizes, device: Pool) -> list[Part]:
@@ -224,6 +244,7 @@ def _rollout(recipe: Recipe, sizes: PartSizes, device: Pool) -> list[Part]:
 
 def _physics(recipe: Recipe, sizes: PartSizes, device: Pool) -> list[Part]:
     engine, envs = recipe.physics.engine, recipe.env.num_envs
+    device = engine_pool(recipe, device)
     counts = sizes.collection
     scene = mujoco.mj_sizeModel(sizes.model)
     parts = [
@@ -232,7 +253,6 @@ def _physics(recipe: Recipe, sizes: PartSizes, device: Pool) -> list[Part]:
             "host",
             counts.motions * scene,
             f"{counts.motions} models x {scene:,} B",
-            not counts.known,
         ),
     ]
     ring = sizes.ring_bytes(recipe, device=device)

@@ -34,6 +34,7 @@ from flashdex.training.checkpoint import (
 from flashdex.training.fixed import refuse_changes
 from flashdex.training.lock import run_lock
 from flashdex.training.memory import check_memory
+from flashdex.training.memory_library import find_library
 from flashdex.training.sessions import end_session
 from flashdex.training.setup import Workbench, open_workbench
 
@@ -59,8 +60,10 @@ def train(recipe: Recipe) -> Path:
     """
     run_dir = default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
-    _LOG.info("%s", check_memory(recipe, run_dir=run_dir))
+    if find_library(recipe) is None:
+        check_memory(recipe, run_dir=run_dir)  # before what may be hours
     bench = open_workbench(recipe)
+    _LOG.info("%s", check_memory(recipe, library=bench.library, run_dir=run_dir))
     with new_run(run_dir, recipe):
         return _train(bench, run_dir, None, [])
 
@@ -87,8 +90,9 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
             set_aside_newer(run_dir, state["env_steps"])
         else:
             _LOG.warning("%s: stopped before its first checkpoint, from 0", run_dir)
-        _LOG.info("%s", check_memory(recipe, run_dir=run_dir))
-        return _train(open_workbench(recipe), run_dir, state, overrides)
+        bench = open_workbench(recipe)
+        _LOG.info("%s", check_memory(recipe, library=bench.library, run_dir=run_dir))
+        return _train(bench, run_dir, state, overrides)
 
 
 def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> Recipe:

@@ -128,10 +128,6 @@ class Workbench:
             FlashdexError: the recipe asks for a device that is not there.
         """
         recipe, device = self.recipe, learner_device(self.recipe)
-        if device.type == "cuda":
-            torch.set_float32_matmul_precision(
-                "high" if recipe.algo.tf32 else "highest"
-            )
         bank = self.bank_on(device)
         transforms = make_transforms(
             recipe.env.transforms,

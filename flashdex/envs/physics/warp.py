@@ -113,10 +113,11 @@ class WarpPhysics:
             held = mask.reshape(-1, *[1] * (view.ndim - 1))
             view.copy_(torch.where(held, 0.0, view))
         # Of the other worlds this changes only what a step computes anew, and what
-        # the sensors said of their last substep.
-        sensed = self._sensor.clone()
+        # the sensors said of their last substep, and the solver's first guess.
+        sensed, guess = self._sensor.clone(), self._warmstart.clone()
         self._forward()
         self._sensor.copy_(torch.where(chosen, self._sensor, sensed))
+        self._warmstart.copy_(torch.where(chosen, self._warmstart, guess))
         self._bad &= ~mask
 
     def step(self, target: Tensor, wrench: ObjectWrench | None = None) -> None:

@@ -49,7 +49,7 @@ quickstart: $(CORE) gl
 	$(BIN)/flashdex train quickstart run_dir=runs/quickstart
 
 test: $(DEV)
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(DEV)
 	$(BIN)/ruff check .

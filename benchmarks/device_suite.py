@@ -43,6 +43,7 @@ class Lines:
     def __init__(self, out: Path, part: str) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         self.out, self.part = out, part
+        self.results = 0  # lines that are no failures
 
     def write(self, job: Job, found: dict[str, Any], **more: Any) -> None:
         """Append one line, on disk when this returns."""
@@ -51,6 +52,7 @@ class Lines:
             file.write(json.dumps({**found, "suite": suite}) + "\n")
             file.flush()
             os.fsync(file.fileno())
+        self.results += "failed" not in found
         print(f"{self.part}: {job.name}: {_brief(found)}", flush=True)
 
     def fail(self, job: Job, why: str, stderr: str = "", **more: Any) -> None:
@@ -215,6 +217,11 @@ def main() -> None:
     parser.add_argument("--tiny", action="store_true", help="only try the commands")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
     args = parser.parse_intermixed_args()
+    if not args.libraries.exists():
+        parser.error(
+            f"--libraries: {args.libraries} does not exist. Make it: python "
+            "benchmarks/suite_libraries.py libraries/suite --pack suite.tar.xz"
+        )
     signal.signal(signal.SIGTERM, _interrupted)
     with tempfile.TemporaryDirectory(prefix="flashdex-suite-") as folder:
         from suite_libraries import unpack
@@ -228,7 +235,10 @@ def main() -> None:
             overrides=args.overrides,
             scratch=scratch,
         )
-        run_part(args.part, choice, Lines(args.out.resolve(), args.part))
+        lines = Lines(args.out.resolve(), args.part)
+        run_part(args.part, choice, lines)
+        if not lines.results:
+            parser.exit(1, f"{args.part}: no result; {args.out} says why\n")
 
 
 if __name__ == "__main__":

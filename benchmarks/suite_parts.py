@@ -8,6 +8,7 @@ from pathlib import Path
 PARTS = ("env", "train", "learner", "replay", "curve")
 CURVE_LIBRARY = "procedural50"
 RECIPE = "bench50_xhand"  # the paper's settings
+FEW_WORLDS = "env.attempt_share=0.5"  # of a handful there must be one
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,9 @@ def _env(choice: Choice) -> list[Job]:
     if not choice.tiny:
         sizes += [(2, 1, 4096), (2, 4, 4096), (2, 8, 4096), (1, 16, 4096), (1, 1, 4096)]
     times = ["--seconds", "0.5" if choice.tiny else "8"]
-    changes = [f"physics={choice.engine}", *choice.overrides]
+    # compiling would be most of a job's time; the full loop has it
+    changes = [f"physics={choice.engine}", "env.compile=false"]
+    changes += [FEW_WORLDS] * choice.tiny + choice.overrides
     return [
         Job(
             f"env o{objects} h{hulls} n{n}",
@@ -90,7 +93,8 @@ def _env(choice: Choice) -> list[Job]:
 
 def _train(choice: Choice) -> list[Job]:
     small = ["algo.batch_size=64", "algo.critic_width=16", "algo.actor_width=16"]
-    small += ["algo.buffer_size=2000", "algo.compile=false"]
+    small += ["algo.buffer_size=2000", "algo.compile=false", "env.compile=false"]
+    small += [FEW_WORLDS]
     large = ["algo.bfloat16=true"]
     changes = [f"physics={choice.engine}", *(small if choice.tiny else large)]
     changes += choice.overrides
@@ -126,6 +130,7 @@ def _replay(choice: Choice) -> list[Job]:
     words = ["bench", "replay", *_scene(choice, 2, 1, None)]
     if choice.tiny:
         words += ["--batch", "64", "--seconds", "0.2", "algo.compile=false"]
+    words += ["env.compile=false"]  # its rows are what is wanted of the environment
     words += choice.overrides
     return [
         Job(
@@ -154,7 +159,8 @@ def _curve(choice: Choice) -> list[Job]:
     if choice.tiny:
         words += ["env.num_envs=8", "algo.batch_size=32", "algo.critic_width=16"]
         words += ["motions.count=1", "algo.buffer_size=2000", "algo.min_buffer=64"]
-        words += ["algo.compile=false", "total_env_steps=160"]
+        words += ["algo.compile=false", "env.compile=false", "total_env_steps=160"]
+        words += [FEW_WORLDS]
     else:
         words += ["env.num_envs=4096", "total_env_steps=30_000_000"]
         words += ["algo.bfloat16=true"]

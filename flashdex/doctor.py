@@ -85,7 +85,10 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     from flashdex.training.setup import learner_device
 
     recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")
-    on_gpu = recipe.physics.engine != "cpu" or learner_device(recipe).type == "cuda"
+    # of a recipe for a GPU the need is of interest also where there is none
+    on_gpu = recipe.algo.device != "cpu" and (
+        recipe.physics.engine != "cpu" or learner_device(recipe).type == "cuda"
+    )
     plan = plan_memory(
         recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
     )

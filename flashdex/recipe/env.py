@@ -103,10 +103,10 @@ class PhysicsConfig:
     """Line-search iterations."""
     num_threads: int = number(0, low=0)
     """Threads of the cpu engine; 0 = all cores."""
-    nconmax: int | None = number(None, low=1)
+    nconmax: int | None = number(None, low=1, high=10_000)
     """Contacts a world, warp only; null = four for each geom that moves. All worlds
     share the room."""
-    njmax: int | None = number(None, low=1)
+    njmax: int | None = number(None, low=1, high=20_000)
     """Constraint rows a world, warp only; null = those of so many contacts and of all
     joint limits."""
 

@@ -103,8 +103,11 @@ class Trainer:
         try:
             with self.stop, self.guard:
                 why = self._loop()
-                self.save()
+                lost = self._settle()
                 self._write_log()
+                self.save()
+                if lost is not None:
+                    raise lost
         except NonFiniteError as error:
             raise self._dump(str(error)) from error
         except OSError as error:
@@ -189,6 +192,14 @@ class Trainer:
         for conversion in self.judging.collect(wait=wait):
             self._mark_converted(conversion.motion)
 
+    def _settle(self) -> RunError | None:
+        """Judge all attempts so far; what was learnt is not lost with the judge."""
+        try:
+            self._judge(self.attempts.look(), wait=True)
+        except RunError as error:
+            return error
+        return None
+
     def _mark_converted(self, name: str) -> None:
         row = self.env.bank.names.index(name)
         self.env.sampler.mark_converted(row)
@@ -261,11 +272,7 @@ class Trainer:
         if self.env_steps == self._saved_at:
             return
         self.guard.check()
-        lost: RunError | None = None
-        try:
-            self._judge(self.attempts.look(), wait=True)  # the ledger says all, then
-        except RunError as error:
-            lost = error  # of the attempts in line; what was learnt is not
+        lost = self._settle()
         state = self.state_dict()
         if bad := first_non_finite(state["learner"]):
             raise NonFiniteError(bad)

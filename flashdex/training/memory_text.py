@@ -6,6 +6,7 @@ import dataclasses
 
 from flashdex.training.memory import POOLS, MemoryPlan, overrides_that_fit
 from flashdex.training.memory_machine import Pool
+from flashdex.training.memory_parts import replay_pool
 
 CARDS = (24, 48, 80, 141)  # GB, as sold
 # Of what is sold a card's driver and display take some before any program starts.
@@ -32,7 +33,7 @@ def format_plan(plan: MemoryPlan) -> str:
     if not plan.sizes.collection.known:
         lines += ["", _assumed(plan)]
     lines += ["", verdict(plan)]
-    if not plan.fits:
+    if not plan.fits and verdict(plan).startswith("It does not"):
         lines += [f"  {words}" for words in overrides_that_fit(plan)]
     return "\n".join(lines)
 
@@ -74,7 +75,8 @@ def verdict(plan: MemoryPlan) -> str:
     """One sentence: it fits, it is tight, or what is short."""
     if plan.device == "gpu" and plan.machine.gpu is None:
         return (
-            "There is no CUDA GPU here: see the cards below, or train with physics=cpu."
+            "There is no CUDA GPU here: see the cards below. What this computer's own "
+            f"memory holds: flashdex doctor {plan.recipe.name} algo.device=cpu"
         )
     if not plan.fits:
         return f"It does not fit: {_shortages(plan, plan.short)}. Any of these fits:"
@@ -147,11 +149,14 @@ def format_cards(plan: MemoryPlan) -> str:
         there = plan.on(machine)
         rows, wanted = there.largest_buffer, plan.recipe.algo.buffer_size
         moved = there.change(algo__replay="pinned")
-        if rows >= wanted:
+        on_host = replay_pool(plan.recipe, "gpu") == "host"
+        if on_host and moved.share("gpu") <= 1:
+            text = f"all but the replay rows ({_percent(there)} used)"
+        elif not on_host and rows >= wanted:
             text = f"all {wanted:,} rows ({_percent(there)} used)"
-        elif rows > 0:
+        elif not on_host and rows > 0:
             text = f"{rows:,} rows; {_pinned(plan)}"
-        elif moved.share("gpu") <= 1:
+        elif not on_host and moved.share("gpu") <= 1:
             text = f"none on the card; {_pinned(plan)}"
         else:
             text = "none; the rest alone does not fit: fewer worlds or a smaller batch"

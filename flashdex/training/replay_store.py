@@ -213,7 +213,7 @@ def make_buffer(
         return RowBuffer(config.buffer_size, generator=generator, **sizes)
     pinned = config.replay == "pinned"
     if pinned:
-        _check_pinning(device)
+        check_pinning(device)
     if device.type != "cpu" or config.prefetch:
         generator = torch.Generator().manual_seed(seed)
     return HostBuffer(
@@ -226,7 +226,15 @@ def make_buffer(
     )
 
 
-def _check_pinning(device: torch.device) -> None:
+def check_pinning(device: torch.device) -> None:
+    """Refuse pinned memory where there is none.
+
+    Args:
+        device: of the learner.
+
+    Raises:
+        FlashdexError: the learner is on no CUDA device, or pinning fails.
+    """
     if device.type != "cuda":
         raise FlashdexError(
             "algo.replay: 'pinned' exchanges rows with a CUDA device, and this learner "

@@ -35,8 +35,9 @@ from flashdex.training.fixed import refuse_changes
 from flashdex.training.lock import run_lock
 from flashdex.training.memory import check_memory
 from flashdex.training.memory_library import find_library
+from flashdex.training.replay_store import check_pinning
 from flashdex.training.sessions import end_session
-from flashdex.training.setup import Workbench, open_workbench
+from flashdex.training.setup import Workbench, learner_device, open_workbench
 
 _LOG = logging.getLogger(__name__)
 VERSIONS = "versions.json"
@@ -60,6 +61,9 @@ def train(recipe: Recipe) -> Path:
     """
     run_dir = default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
+    device = learner_device(recipe)
+    if recipe.algo.replay == "pinned":
+        check_pinning(device)
     if find_library(recipe) is None:
         check_memory(recipe, run_dir=run_dir)  # before what may be hours
     bench = open_workbench(recipe)

@@ -132,11 +132,6 @@ class TrackingEnv(EnvBase):
         for i, side in enumerate(keys.SIDES):
             td.set(keys.action(side), action[:, i].to(self.device))
 
-    def load_generator(self, state: Tensor) -> None:
-        """Go on with a stored state of the generator; one of another device is not."""
-        if len(state) == len(self.generator.get_state()):
-            self.generator.set_state(state)
-
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(0 if seed is None else seed)
 
@@ -189,9 +184,13 @@ class TrackingEnv(EnvBase):
         self._target = torch.where(rows, start["joint_pos"], self._target)
         self.judge.reset(mask)
         state = self.physics.state()
-        kin = self.kinematics(state[keys.JOINT_POS], None)
-        code = contact_code(state[keys.CONTACT], kin)
-        self._contact = torch.where(rows.unsqueeze(-1), code, self._contact)
+        self._contact = self._contact.clone()
+        ids = mask.nonzero().squeeze(-1) if self.host_sees else slice(None)
+        kin = self.kinematics(state[keys.JOINT_POS][ids], None)
+        code = contact_code(state[keys.CONTACT][ids], kin)
+        if not self.host_sees:
+            code = torch.where(rows.unsqueeze(-1), code, self._contact)
+        self._contact[ids] = code
         return self._observation(state)
 
     def _draw(self) -> ResetDraw:
@@ -282,6 +281,7 @@ class TrackingEnv(EnvBase):
             torque_ratio=limits.torque_ratio,
             force_limit=limits.force_limit,
             torque_limit=limits.torque_limit,
+            assists=assist is not None,
         )
 
     def _observation(self, state: TensorDictBase) -> TensorDict:

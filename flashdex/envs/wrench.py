@@ -40,6 +40,7 @@ class ObjectWrench:
         torque_ratio: angular over linear stiffness of the assist.
         force_limit: of the assist, each component, N.
         torque_limit: of the assist, each component, N m.
+        assists: any world has assist gains; without them the term is left out.
     """
 
     ref_pose: Tensor
@@ -54,6 +55,7 @@ class ObjectWrench:
     torque_ratio: float
     force_limit: float
     torque_limit: float
+    assists: bool = True
 
     def __call__(self, pose: Tensor, vel: Tensor) -> Tensor:
         """Force and torque on each object, world axes, (N, O, 6).
@@ -72,18 +74,19 @@ class ObjectWrench:
             self.hold,
             stiffness=self.hold_stiffness,
         )
-        total = total + assist_wrench(
-            pose,
-            vel,
-            self.ref_pose,
-            self.ref_vel,
-            self.inertia,
-            self.kp,
-            self.kv,
-            torque_ratio=self.torque_ratio,
-            force_limit=self.force_limit,
-            torque_limit=self.torque_limit,
-        )
+        if self.assists:
+            total = total + assist_wrench(
+                pose,
+                vel,
+                self.ref_pose,
+                self.ref_vel,
+                self.inertia,
+                self.kp,
+                self.kv,
+                torque_ratio=self.torque_ratio,
+                force_limit=self.force_limit,
+                torque_limit=self.torque_limit,
+            )
         return torch.where(self.present.unsqueeze(-1), total, 0.0)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from flashdex.modules.generator import restore_generator
 from flashdex.recipe import dump_recipe
 
 if TYPE_CHECKING:
@@ -49,5 +50,5 @@ def load_loop_state(trainer: Trainer, state: dict[str, Any]) -> None:
     if trainer.env.assist is not None and state["assist"] is not None:
         trainer.env.assist.load_state_dict(state["assist"])
         trainer.env.redraw_assist()
-    trainer.env.load_generator(state["env_generator"])
+    restore_generator(trainer.env.generator, state["env_generator"])
     torch.set_rng_state(state["torch_rng"])

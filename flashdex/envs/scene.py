@@ -154,6 +154,26 @@ def _to_xml(spec: mujoco.MjSpec) -> str:
     return spec.to_xml()
 
 
+def make_hands_spec(
+    sides: tuple[keys.Side, ...],
+    hands: dict[keys.Side, HandSpec],
+    physics: PhysicsConfig,
+) -> mujoco.MjSpec:
+    """Begin a scene: options and hands, with their gains and friction.
+
+    Args:
+        sides: hands that the scene has.
+        hands: hand specs by side.
+        physics: time step, solver, gains, friction.
+    """
+    spec = mujoco.MjSpec()
+    set_options(spec, physics)
+    for side in sides:
+        add_hand(spec, hands[side], gains=physics.gains, gravcomp=physics.gravcomp)
+        set_hand_friction(spec, side, physics.friction)
+    return spec
+
+
 def _make_spec(
     library: MotionLibrary,
     motion: int,
@@ -161,11 +181,7 @@ def _make_spec(
     physics: PhysicsConfig,
     layout: SceneLayout,
 ) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
-    set_options(spec, physics)
-    for side in layout.sides:
-        add_hand(spec, hands[side], gains=physics.gains, gravcomp=physics.gravcomp)
-        set_hand_friction(spec, side, physics.friction)
+    spec = make_hands_spec(layout.sides, hands, physics)
     rows = library.motions["object_index"][motion].tolist()
     for slot in range(layout.num_objects):
         add_object(spec, library, rows[slot], slot, layout.num_parts[slot], physics)

@@ -17,17 +17,14 @@ import numpy as np
 import torch
 
 from flashdex import keys
-from flashdex.envs.scene import Scene, SceneLayout
+from flashdex.envs.scene import Scene, SceneLayout, make_hands_spec
 from flashdex.envs.scene_parts import (
     add_contact_sensors,
     add_object_of_meshes,
     add_part_mesh,
     add_supports,
-    set_hand_friction,
-    set_options,
 )
 from flashdex.errors import FlashdexError
-from flashdex.hands.attach import add_hand
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
@@ -79,7 +76,9 @@ def build_union(
     # From text as the scenes are, so that vertices are rounded alike.
     model = mujoco.MjModel.from_xml_string(spec.to_xml())
     rows = {}
-    mesh_ids = np.stack([_mesh_ids(library, m, scenes, model) for m in _range(scenes)])
+    mesh_ids = np.stack(
+        [_mesh_ids(library, m, scenes, model) for m in range(len(scenes))]
+    )
     unused = np.stack([_unused(s.model, model) for s in scenes])
     for name in fields:
         own = getattr(model, name, None)
@@ -97,21 +96,13 @@ def build_union(
     return SceneUnion(model, rows, _contact(library, hands, layout, model))
 
 
-def _range(scenes: list[Scene]) -> range:
-    return range(len(scenes))
-
-
 def _union_spec(
     library: MotionLibrary,
     hands: dict[keys.Side, HandSpec],
     physics: PhysicsConfig,
     layout: SceneLayout,
 ) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
-    set_options(spec, physics)
-    for side in layout.sides:
-        add_hand(spec, hands[side], gains=physics.gains, gravcomp=physics.gravcomp)
-        set_hand_friction(spec, side, physics.friction)
+    spec = make_hands_spec(layout.sides, hands, physics)
     names = []
     for row in sorted(set(library.motions["object_index"].flatten().tolist()) - {-1}):
         for i, part in enumerate(library.parts(row)):

@@ -91,11 +91,13 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
         if has_checkpoint(run_dir):
             state = load_checkpoint(run_dir, RESUMED)
             refuse_changes(state["recipe"], recipe)
+        bench = open_workbench(recipe)
+        _LOG.info("%s", check_memory(recipe, library=bench.library, run_dir=run_dir))
+        # Nothing of the run is touched before all that could refuse it.
+        if state is not None:
             set_aside_newer(run_dir, state["env_steps"])
         else:
             _LOG.warning("%s: stopped before its first checkpoint, from 0", run_dir)
-        bench = open_workbench(recipe)
-        _LOG.info("%s", check_memory(recipe, library=bench.library, run_dir=run_dir))
         return _train(bench, run_dir, state, overrides)
 
 

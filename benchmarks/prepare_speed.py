@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from flashdex.bench.machine import describe_commit, describe_hardware
 from flashdex.motions.prepare import prepare
+from flashdex.system.machine import describe_commit, describe_hardware
 
 
 def seconds(limit: int, workers: int, folder: Path, cache: Path) -> float:

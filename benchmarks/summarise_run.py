@@ -9,8 +9,8 @@ import argparse
 import json
 from pathlib import Path
 
-from flashdex.bench.machine import describe_commit, describe_hardware
-from flashdex.training.jsonl import read_lines
+from flashdex.system.jsonl import read_lines
+from flashdex.system.machine import describe_commit, describe_hardware
 
 
 def summarise(run_dir: Path) -> dict[str, object]:

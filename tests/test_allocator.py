@@ -10,7 +10,7 @@ import pytest
 # Blocks as the activations of an update, taken and freed together, again and again.
 PROGRAM = """
 import resource, sys
-from flashdex.allocator import keep_freed_memory
+from flashdex.system.allocator import keep_freed_memory
 if sys.argv[1] == "keep":
     print(keep_freed_memory(), end=" ")
 def update():

@@ -9,8 +9,8 @@ import pytest
 
 from flashdex import doctor
 from flashdex.cli import main
+from flashdex.system.machine import Machine
 from flashdex.training import memory
-from flashdex.training.memory_machine import Machine
 
 PAGE = Path(__file__).parent.parent / "docs" / "memory.md"
 GB = 10**9

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from flashdex.files import open_atomic, write_atomic
+from flashdex.system.files import open_atomic, write_atomic
 
 
 def test_a_file_is_replaced_and_no_temporary_one_stays(tmp_path):

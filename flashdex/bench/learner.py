@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 
-from flashdex.allocator import keep_freed_memory
 from flashdex.bench.ceilings import float32_products
 from flashdex.bench.clock import memory_gb, reset_peak_memory
 from flashdex.bench.learner_measure import measure
@@ -22,6 +21,7 @@ from flashdex.bench.learner_recipe import measure_recipe
 from flashdex.bench.learner_sizes import SIZES
 from flashdex.bench.output import add_output_options, emit
 from flashdex.errors import FlashdexError
+from flashdex.system.allocator import keep_freed_memory
 
 NORMAL_SIZES = ("quickstart", "b512", "b2048")
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from flashdex.bench.machine import describe_commit, describe_machine
+from flashdex.system.machine import describe_commit, describe_machine
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:

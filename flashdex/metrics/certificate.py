@@ -16,7 +16,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from flashdex.files import write_atomic
 from flashdex.metrics.criteria import resolve_criterion, score
 from flashdex.metrics.perturbation import Perturbation, perturb
 from flashdex.metrics.resimulation import (
@@ -34,6 +33,7 @@ from flashdex.metrics.safety import (
     state_deviation,
 )
 from flashdex.metrics.verdict import CertificateVerdict, Verdict
+from flashdex.system.files import write_atomic
 
 CERTIFICATE_SCHEMA = 1
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs

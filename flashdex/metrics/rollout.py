@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import RunError
-from flashdex.files import open_atomic
 from flashdex.metrics.rollout_schema import (
     ROLLOUT_SCHEMA,
     SHAPES,
@@ -24,6 +23,7 @@ from flashdex.metrics.rollout_schema import (
     check_shape,
 )
 from flashdex.metrics.signals import Signals, compute_signals
+from flashdex.system.files import open_atomic
 
 
 @dataclass

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flashdex.files import open_atomic
+from flashdex.system.files import open_atomic
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from flashdex.files import waiting_lock
 from flashdex.motions.convex import compute_convex_parts, compute_mass_properties
 from flashdex.motions.meshes import (
     clean_mesh,
@@ -23,6 +22,7 @@ from flashdex.motions.meshes import (
 )
 from flashdex.motions.object_cache import Values, read_cache, write_cache
 from flashdex.motions.signed_distance import make_distance_grid
+from flashdex.system.files import waiting_lock
 
 logger = logging.getLogger(__name__)
 

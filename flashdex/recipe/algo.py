@@ -9,8 +9,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from flashdex.recipe.fields import number
 from flashdex.recipe.ppo import PPOConfig
+from flashdex.system.fields import number
 
 Criterion = Literal[
     "sr_mt_obj",

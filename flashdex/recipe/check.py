@@ -13,10 +13,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from flashdex.errors import RecipeError, nearest
-from flashdex.recipe.fields import range_problem
 from flashdex.recipe.kinds import split_foreign
 from flashdex.recipe.options import REGISTRY, Kind
 from flashdex.recipe.schema import RunRecipe
+from flashdex.system.fields import range_problem
 
 R = TypeVar("R", bound=RunRecipe)
 _NAMED: dict[str, Kind] = {f"env.{kind}": kind for kind in REGISTRY}

@@ -9,8 +9,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from flashdex.recipe.fields import number
 from flashdex.recipe.options import default_mapping
+from flashdex.system.fields import number
 
 
 def _default_transforms() -> dict[str, dict[str, Any] | None]:

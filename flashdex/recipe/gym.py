@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flashdex.recipe.algo import AlgoConfig, LoopConfig
-from flashdex.recipe.fields import number
 from flashdex.recipe.relations import expect_conflicts, rate_conflicts, replay_conflicts
 from flashdex.recipe.schema import RunRecipe
+from flashdex.system.fields import number
 
 # Keys of `algo` that speak of hands or of the future window.
 HAND_ONLY = (

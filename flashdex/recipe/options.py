@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flashdex.errors import UnknownNameError
-from flashdex.recipe.fields import number
+from flashdex.system.fields import number
 
 
 @dataclass(frozen=True, kw_only=True)

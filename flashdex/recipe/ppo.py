@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from flashdex.recipe.fields import number
+from flashdex.system.fields import number
 
 
 @dataclass(frozen=True, kw_only=True)

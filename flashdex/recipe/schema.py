@@ -8,7 +8,7 @@ from typing import Literal
 
 from flashdex.recipe.algo import AlgoConfig, LoggerConfig, TrainConfig
 from flashdex.recipe.env import EnvConfig, MotionsConfig, PhysicsConfig
-from flashdex.recipe.fields import number
+from flashdex.system.fields import number
 
 
 @dataclass(frozen=True, kw_only=True)

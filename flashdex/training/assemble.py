@@ -15,9 +15,10 @@ import torch
 from flashdex.envs.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
-from flashdex.files import write_atomic
 from flashdex.recipe import dump_recipe
-from flashdex.training.attempts import AttemptMaker, versions
+from flashdex.system.files import write_atomic
+from flashdex.system.machine import versions
+from flashdex.training.attempts import AttemptMaker
 from flashdex.training.baselines import score_baselines
 from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
 from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder, Judging

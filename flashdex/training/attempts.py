@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -23,10 +19,6 @@ from flashdex.hands.spec import HandSpec
 from flashdex.metrics.rollout import Rollout
 from flashdex.training.attempt_ring import Episode
 
-ENGINE_PACKAGES = {
-    "warp": ("mujoco-warp", "warp-lang"),
-    "brax": ("mujoco-mjx", "jax", "brax"),
-}
 GRACE_S = 0.25  # s; 15 steps at 60 Hz, as the criteria define it
 
 
@@ -204,31 +196,3 @@ def _objects(
 
 def _float64(td: TensorDictBase, key: str) -> np.ndarray:
     return np.asarray(td[key], dtype=np.float64)
-
-
-def versions(engine: str = "cpu", device: torch.device | None = None) -> dict[str, Any]:
-    """Package versions, engine and hardware that produce a rollout.
-
-    Args:
-        engine: physics engine of the recipe.
-        device: where it ran; the cpu when None.
-    """
-    names = ("flashdex", "torch", "torchrl", "tensordict")
-    found: dict[str, Any] = {}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except ModuleNotFoundError:
-            found[name] = "source"
-    for name in ENGINE_PACKAGES.get(engine, ()):
-        found[name] = version(name)
-    hardware = f"{platform.machine()}, {os.cpu_count()} CPU cores"
-    if device is not None and device.type == "cuda":
-        hardware = f"{torch.cuda.get_device_name(device)}, {hardware}"
-    return {
-        **found,
-        "mujoco": mujoco.__version__,
-        "python": platform.python_version(),
-        "engine": engine,
-        "hardware": hardware,
-    }

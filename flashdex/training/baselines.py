@@ -12,9 +12,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.files import write_atomic
 from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.trivial import frozen_object
+from flashdex.system.files import write_atomic
 from flashdex.training.attempts import grace_steps
 from flashdex.training.rollouts import roll_all
 from flashdex.training.setup import Workbench

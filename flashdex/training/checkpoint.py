@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from flashdex.errors import RunError
-from flashdex.files import open_atomic
+from flashdex.system.files import open_atomic
 
 if TYPE_CHECKING:
     from flashdex.training.replay_file import ReplayLog

@@ -11,9 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.files import write_atomic
 from flashdex.metrics.aggregate import mean_object_errors, mope_more
 from flashdex.metrics.criteria import score
+from flashdex.system.files import write_atomic
 from flashdex.training.assemble import restore
 from flashdex.training.checkpoint import EVALUATED, load_checkpoint
 from flashdex.training.fixed import stored_value

@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 
-from flashdex.allocator import keep_freed_memory
 from flashdex.errors import FlashdexError, RunError
-from flashdex.files import write_atomic
 from flashdex.recipe import GymRecipe, dump_recipe, expect_kind, load_recipe
+from flashdex.system.allocator import keep_freed_memory
+from flashdex.system.files import run_lock, write_atomic
 from flashdex.training.checkpoint import (
     checkpoint_name,
     checkpoint_names,
@@ -27,7 +27,6 @@ from flashdex.training.gym import GymWorlds
 from flashdex.training.gym_evaluate import evaluate_recipe
 from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_loop import GymTrainer
-from flashdex.training.lock import run_lock
 from flashdex.training.logging import MetricLog
 from flashdex.training.replay_file import ReplayLog
 from flashdex.training.run import RECIPE, create_run_dir, default_run_dir

@@ -15,8 +15,8 @@ from flashdex.errors import RunError
 from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
 from flashdex.metrics.rollout import Rollout
+from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.training.attempts import Attempt
-from flashdex.training.jsonl import append_line, drop_cut_line, read_lines
 
 _LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"

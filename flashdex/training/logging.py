@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from flashdex.errors import FlashdexError
-from flashdex.files import write_atomic
-from flashdex.training.jsonl import drop_cut_line, keep_lines
+from flashdex.system.files import write_atomic
+from flashdex.system.jsonl import drop_cut_line, keep_lines
 
 if TYPE_CHECKING:
     from flashdex.recipe import RunRecipe

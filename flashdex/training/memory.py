@@ -15,8 +15,8 @@ from pathlib import Path
 from flashdex.errors import FlashdexError
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
+from flashdex.system.machine import Machine, Pool, look_at_machine
 from flashdex.training.memory_library import find_library, read_sizes, worst_sizes
-from flashdex.training.memory_machine import Machine, Pool, look_at_machine
 from flashdex.training.memory_parts import Part, PartSizes, list_parts, replay_pool
 from flashdex.training.setup import learner_device
 

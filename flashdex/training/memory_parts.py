@@ -17,6 +17,7 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene import build_scenes
 from flashdex.hands.spec import load_hand
 from flashdex.recipe import Recipe
+from flashdex.system.machine import Pool
 from flashdex.training.attempt_ring import LOOK_EVERY
 from flashdex.training.memory_learner import LearnerSizes
 from flashdex.training.memory_library import (
@@ -26,7 +27,6 @@ from flashdex.training.memory_library import (
     Collection,
     stand_in,
 )
-from flashdex.training.memory_machine import Pool
 from flashdex.training.memory_walk import tensor_bytes
 
 # Allowances: what no arithmetic gives. On the GPU the contexts of torch and warp, their

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from flashdex.system.machine import Pool
 from flashdex.training.memory import POOLS, MemoryPlan, overrides_that_fit
-from flashdex.training.memory_machine import Pool
 from flashdex.training.memory_parts import replay_pool
 
 CARDS = (24, 48, 80, 141)  # GB, as sold

@@ -11,8 +11,8 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.errors import RunError
-from flashdex.files import open_atomic
 from flashdex.recipe import Recipe, dump_recipe, expect_kind, load_recipe
+from flashdex.system.files import open_atomic
 from flashdex.training.checkpoint import (
     FORMAT,
     check_format,

@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from flashdex.files import open_atomic, write_atomic
+from flashdex.system.files import open_atomic, write_atomic
 from flashdex.training.checkpoint import FOLDER
 from flashdex.training.replay_store import RowBuffer
 

@@ -12,9 +12,7 @@ from typing import Any
 
 import torch
 
-from flashdex.allocator import keep_freed_memory
 from flashdex.errors import RunError
-from flashdex.files import write_atomic
 from flashdex.recipe import (
     Recipe,
     RunRecipe,
@@ -22,8 +20,10 @@ from flashdex.recipe import (
     expect_kind,
     load_recipe,
 )
+from flashdex.system.allocator import keep_freed_memory
+from flashdex.system.files import run_lock, write_atomic
+from flashdex.system.machine import versions
 from flashdex.training.assemble import RECIPE, make_trainer
-from flashdex.training.attempts import versions
 from flashdex.training.checkpoint import (
     RESUMED,
     has_checkpoint,
@@ -32,7 +32,6 @@ from flashdex.training.checkpoint import (
     set_aside_newer,
 )
 from flashdex.training.fixed import refuse_changes
-from flashdex.training.lock import run_lock
 from flashdex.training.memory import check_memory
 from flashdex.training.memory_library import find_library
 from flashdex.training.replay_store import check_pinning

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flashdex.training.jsonl import append_line, drop_cut_line, read_lines
+from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.training.ledger import CONVERSIONS
 from flashdex.training.logging import METRICS
 

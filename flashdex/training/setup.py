@@ -22,7 +22,8 @@ from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
-from flashdex.training.attempts import AttemptMaker, versions
+from flashdex.system.machine import versions
+from flashdex.training.attempts import AttemptMaker
 from flashdex.training.collection import load_library, select_motions
 from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.learner import Learner

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from flashdex.errors import LibraryError
-from flashdex.files import write_atomic
 from flashdex.motions.library import MotionLibrary
+from flashdex.system.files import write_atomic
 from flashdex.viz.html import Html, duration, facts, joined, number, page, table, tag
 from flashdex.viz.library_cards import motion_card
 from flashdex.viz.library_facts import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from flashdex.errors import RunError
-from flashdex.files import write_atomic
+from flashdex.system.files import write_atomic
 from flashdex.viz.curves import conversion_charts, learning_charts
 from flashdex.viz.facts import MotionFacts, count, motion_facts, num_motions
 from flashdex.viz.film import Film, draw_films

@@ -14,10 +14,10 @@ import torch
 from flashdex import keys
 from flashdex.errors import RunError
 from flashdex.recipe import MotionsConfig
+from flashdex.system.jsonl import read_lines
+from flashdex.system.machine import versions
 from flashdex.training.assemble import start_judge
 from flashdex.training.attempt_ring import AttemptRing
-from flashdex.training.attempts import versions
-from flashdex.training.jsonl import read_lines
 from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder
 from flashdex.training.ledger import CONVERSIONS, Ledger
 

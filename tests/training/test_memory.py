@@ -10,6 +10,7 @@ from torch import nn
 
 from flashdex.errors import FlashdexError
 from flashdex.recipe import AlgoConfig, EnvConfig, PhysicsConfig, Recipe
+from flashdex.system.machine import Machine
 from flashdex.training import memory
 from flashdex.training.memory import (
     MemoryPlan,
@@ -19,7 +20,6 @@ from flashdex.training.memory import (
     round_down,
 )
 from flashdex.training.memory_library import read_sizes
-from flashdex.training.memory_machine import Machine
 from flashdex.training.memory_parts import GPU_ALLOWANCE, list_parts
 from flashdex.training.memory_text import format_cards, format_plan, format_size
 from flashdex.training.memory_walk import tensor_bytes

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from flashdex.training.memory_machine import free_host, look_at_machine
+from flashdex.system.machine import free_host, look_at_machine
 
 GB = 10**9
 

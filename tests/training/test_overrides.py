@@ -11,9 +11,9 @@ import torch
 from flashdex.cli import main
 from flashdex.errors import RunError
 from flashdex.recipe import AlgoConfig, Recipe, dump_recipe
+from flashdex.system.files import run_lock
 from flashdex.training.checkpoint import RESUMED, load_checkpoint
 from flashdex.training.fixed import refuse_changes
-from flashdex.training.lock import run_lock
 from flashdex.training.run import RECIPE, new_run, resume
 
 CHANGES = {

@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
+from flashdex.errors import RunError
+
 try:
     import fcntl
 except ImportError:  # not a POSIX system
@@ -88,3 +90,34 @@ def _hash_file(path: Path, size: int, changed: int) -> str:
     del size, changed  # they are part of the cache's key only
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+LOCK = ".lock"
+
+
+@contextmanager
+def run_lock(run_dir: Path) -> Iterator[None]:
+    """Hold a run directory; a second training process there is refused.
+
+    File systems without locks are used without one.
+
+    Args:
+        run_dir: existing run directory.
+
+    Raises:
+        RunError: another process trains in it.
+    """
+    if fcntl is None:
+        yield
+        return
+    with (run_dir / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(
+                f"{run_dir}: another process is training in this folder. Wait for it, "
+                "stop it, or choose another folder with run_dir=..."
+            ) from error
+        except OSError:
+            pass
+        yield

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flashdex.files import write_atomic
+from flashdex.system.files import write_atomic
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:

@@ -1,0 +1,1 @@
+"""Atomic files, locks, JSON lines, this machine: what knows no domain."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.objects import ObjectAsset
+from flashdex.objects.asset import ObjectAsset
 
 FPS = 60.0
 HALF = np.array([0.025, 0.03, 0.02])  # m, half extents of the box

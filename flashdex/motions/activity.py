@@ -11,10 +11,10 @@ from scipy.ndimage import uniform_filter1d
 from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.gaps import missing_frames
-from flashdex.motions.meshes import reduce_mesh
-from flashdex.motions.signed_distance import surface_distance
 from flashdex.motions.support import STILL_SPEED, STILL_TURN, runs
 from flashdex.motions.tracks import angular_velocity, linear_velocity, rotation
+from flashdex.objects.meshes import reduce_mesh
+from flashdex.objects.signed_distance import surface_distance
 
 TOUCH, LEAVE = 0.02, 0.03  # m: a touch begins below the first, ends above the second
 BRIDGE_SECONDS = 0.5  # shorter interruptions are none

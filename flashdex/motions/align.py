@@ -17,7 +17,6 @@ from flashdex.motions.contacts import (
 )
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
-from flashdex.motions.meshes import clean_mesh, hull_vertices
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import (
     continuous,
@@ -26,6 +25,7 @@ from flashdex.motions.tracks import (
     sample_times,
     transform_pose,
 )
+from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 # turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
 UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}

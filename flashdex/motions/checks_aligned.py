@@ -14,11 +14,11 @@ from flashdex.motions.align import AlignedDemo
 from flashdex.motions.checks import Finding, reject
 from flashdex.motions.checks_objects import check_objects, check_overlap
 from flashdex.motions.gravity import Up, check_up
-from flashdex.motions.meshes import hull_vertices
-from flashdex.motions.objects import ObjectAsset
 from flashdex.motions.penetration import Penetration
 from flashdex.motions.support import lowest_points, runs, still_runs
 from flashdex.motions.tracks import rotation
+from flashdex.objects.asset import ObjectAsset
+from flashdex.objects.meshes import hull_vertices
 
 REACH = 1.0  # m
 CONTACT_NEAR = 0.02  # m

@@ -11,9 +11,9 @@ from scipy.spatial import ConvexHull
 
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.motions.checks import Finding, reject
-from flashdex.motions.objects import ObjectAsset
-from flashdex.motions.symmetry import revolution_axis
 from flashdex.motions.tracks import rotation
+from flashdex.objects.asset import ObjectAsset
+from flashdex.objects.symmetry import revolution_axis
 
 EXTENTS = (0.005, 1.5)  # m, of a mesh
 HOLLOW = 3.0  # volume of the convex hull over that of the mesh

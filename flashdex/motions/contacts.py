@@ -7,9 +7,9 @@ import trimesh
 from scipy.ndimage import binary_closing, uniform_filter1d
 
 from flashdex.keys import TIP_KEYPOINTS
-from flashdex.motions.signed_distance import surface_distance
 from flashdex.motions.support import runs
 from flashdex.motions.tracks import rotation
+from flashdex.objects.signed_distance import surface_distance
 
 CONTACT_DISTANCE = 0.015  # m
 NO_OBJECT = 10.0  # m, tip distance of a hand without object

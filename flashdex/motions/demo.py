@@ -11,7 +11,7 @@ import trimesh
 
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.meshes import load_mesh
+from flashdex.objects.meshes import load_mesh
 
 MIN_FRAMES = 10
 MIN_SECONDS = 0.5

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from flashdex.motions.align import UP_ROTATION
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.gaps import missing_frames
-from flashdex.motions.meshes import clean_mesh, hull_vertices
 from flashdex.motions.support import estimate_support, runs
 from flashdex.motions.tracks import transform_pose
+from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 
 def demo_support(

@@ -18,7 +18,7 @@ import zipfile
 from pathlib import Path
 
 from flashdex.errors import DemoError, UnknownNameError
-from flashdex.motions.objects import default_cache_dir
+from flashdex.objects.asset import default_cache_dir
 
 WHEEL = "myosuite==2.12.2"
 WHEEL_SHA256 = "bec0133d9d4ba0249aeccdd7de632eead4749436ffb4e5a3c44a8f9cedafd9ea"

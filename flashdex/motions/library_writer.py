@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from flashdex.errors import LibraryError
 from flashdex.keys import FINGERS, SIDES
 from flashdex.motions.library import FRAME_KEYS, QUALITY_KEYS, SCHEMA
-from flashdex.motions.objects import ObjectAsset
+from flashdex.objects.asset import ObjectAsset
 
 # what is no part of the name of a folder, and how long one may be
 NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60

@@ -19,10 +19,9 @@ import numpy as np
 
 import flashdex
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.object_cache import DAMAGED
-from flashdex.motions.objects import read_object
 from flashdex.motions.process import MotionSettings, Prepared
 from flashdex.motions.recording import Recording
+from flashdex.objects.asset import DAMAGED, read_object
 from flashdex.system.files import hash_file, open_atomic
 
 logger = logging.getLogger(__name__)

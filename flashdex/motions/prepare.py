@@ -21,12 +21,12 @@ from flashdex.motions.jobs import Job, Outcome
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.motion_cache import cache_file, content_hash
-from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.process import MotionSettings
 from flashdex.motions.recording import Recording, SourceOptions
 from flashdex.motions.residuals import RetargetWeights
 from flashdex.motions.sources import list_recordings
+from flashdex.objects.asset import ObjectSettings
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 _LOG = logging.getLogger(__name__)

@@ -13,6 +13,7 @@ import torch
 
 from flashdex.errors import DemoError, MeshError
 from flashdex.geometry.rotation import quat_mul, quat_rotate
+from flashdex.hands.collision_spheres import HandModel
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.keys import SIDES, Side
 from flashdex.motions.align import AlignedDemo, align
@@ -22,22 +23,21 @@ from flashdex.motions.checks_aligned import check_aligned, check_retarget
 from flashdex.motions.checks_hands import check_company, check_sides
 from flashdex.motions.contacts import NO_OBJECT, blend
 from flashdex.motions.demo import HumanDemo
-from flashdex.motions.hand_model import HandModel
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.meshes import hull_vertices
-from flashdex.motions.objects import (
+from flashdex.motions.penetration import make_reference_scene, measure_penetration
+from flashdex.motions.residuals import RetargetWeights, Targets
+from flashdex.motions.retarget import Retargeter
+from flashdex.motions.support import support_disks
+from flashdex.motions.tracks import angular_velocity, linear_velocity
+from flashdex.objects.asset import (
     ObjectAsset,
     ObjectSettings,
     default_cache_dir,
     make_object,
+    make_slot_grid,
 )
-from flashdex.motions.penetration import make_reference_scene, measure_penetration
-from flashdex.motions.residuals import RetargetWeights, Targets
-from flashdex.motions.retarget import Retargeter
-from flashdex.motions.solid import make_slot_grid
-from flashdex.motions.support import support_disks
-from flashdex.motions.tracks import angular_velocity, linear_velocity
+from flashdex.objects.meshes import hull_vertices
 
 # where the joints of a hand that takes no part rest, m: out of everyone's way
 PARKED = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])

@@ -20,8 +20,8 @@ from flashdex.geometry.rotation import (
     quat_to_rotvec,
 )
 from flashdex.geometry.sdf import SdfGrid
-from flashdex.motions.hand_jacobian import JointFrames
-from flashdex.motions.hand_model import HandModel
+from flashdex.hands.collision_spheres import HandModel
+from flashdex.hands.jacobian import JointFrames
 
 Part = tuple[Tensor, Tensor]
 

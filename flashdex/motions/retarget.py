@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from flashdex.geometry.sdf import SdfGrid
+from flashdex.hands.collision_spheres import HandModel
+from flashdex.hands.jacobian import HandJacobian
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import Side
-from flashdex.motions.hand_jacobian import HandJacobian
-from flashdex.motions.hand_model import HandModel
 from flashdex.motions.residuals import Residuals, RetargetWeights, Targets
 from flashdex.motions.wrist import unwrap_wrist
 

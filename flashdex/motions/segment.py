@@ -27,11 +27,11 @@ from flashdex.motions.checks import (
 from flashdex.motions.demo import HumanDemo
 from flashdex.motions.demo_support import demo_support
 from flashdex.motions.gaps import missing_frames
-from flashdex.motions.meshes import clean_mesh
 from flashdex.motions.neighbours import Surfaces
 from flashdex.motions.repair import keep
 from flashdex.motions.roles import Use, find_use
 from flashdex.motions.support import runs
+from flashdex.objects.meshes import clean_mesh
 
 MARGIN_SECONDS = 0.33
 CALM_SECONDS = 0.5  # a still point is the middle of this long a calm

@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from flashdex.envs.scene import SceneLayout
 from flashdex.keys import SIDES
 from flashdex.motions.library import NUM_OBJECT_SLOTS, MotionLibrary
-from flashdex.motions.objects import ObjectSettings
+from flashdex.objects.asset import ObjectSettings
 from flashdex.recipe import Recipe
 from flashdex.training.collection import library_name, select_motions
 

@@ -12,10 +12,14 @@ from flashdex.motions.checks_objects import check_objects, check_overlap
 from flashdex.motions.contacts import tip_distances
 from flashdex.motions.gravity import check_up
 from flashdex.motions.jumps import outliers
-from flashdex.motions.objects import ObjectAsset, ObjectSettings, make_object
-from flashdex.motions.solid import make_slot_grid
 from flashdex.motions.sources.procedural import procedural
-from flashdex.motions.symmetry import revolution_axis
+from flashdex.objects.asset import (
+    ObjectAsset,
+    ObjectSettings,
+    make_object,
+    make_slot_grid,
+)
+from flashdex.objects.symmetry import revolution_axis
 
 FPS = 60.0
 QUICK = ObjectSettings(sdf_resolution=32, max_parts=1)

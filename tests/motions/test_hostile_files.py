@@ -13,12 +13,10 @@ import trimesh
 import flashdex
 from flashdex.cli import main
 from flashdex.errors import DemoError, LibraryError, MeshError
-from flashdex.motions import meshes, motion_cache
+from flashdex.motions import motion_cache
 from flashdex.motions.fetch import fetch
 from flashdex.motions.jobs import Job, run_job
 from flashdex.motions.library_writer import LibraryWriter, _unique_names
-from flashdex.motions.meshes import load_mesh
-from flashdex.motions.objects import ObjectSettings, make_object
 from flashdex.motions.process import MotionSettings
 from flashdex.motions.recording import Recording, SourceOptions
 from flashdex.motions.sources import list_recordings
@@ -27,6 +25,9 @@ from flashdex.motions.sources.hot3d_time import frame_axis
 from flashdex.motions.sources.procedural import procedural
 from flashdex.motions.sources.spider_scene import known_files, read_objects
 from flashdex.motions.tracks import palm_frame
+from flashdex.objects import meshes
+from flashdex.objects.asset import ObjectSettings, make_object
+from flashdex.objects.meshes import load_mesh
 
 BOX = trimesh.creation.box((0.05, 0.05, 0.05))
 

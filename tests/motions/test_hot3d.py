@@ -12,12 +12,12 @@ from layouts.umetrack import UMETRACK_SHIFT, umetrack_keypoints
 from scipy.spatial.transform import Rotation
 from trimesh.proximity import closest_point
 
-from flashdex.motions.meshes import load_mesh
 from flashdex.motions.recording import SourceOptions
 from flashdex.motions.sources.hot3d import list_hot3d
 from flashdex.motions.sources.hot3d_files import Mask, Track
 from flashdex.motions.sources.hot3d_time import frame_axis
 from flashdex.motions.umetrack import load_umetrack
+from flashdex.objects.meshes import load_mesh
 
 NAME = "P0003_c701bd11"
 TO_Z_UP = Rotation.from_euler("x", 90, degrees=True)

@@ -12,7 +12,6 @@ from flashdex.errors import DemoError
 from flashdex.motions.align import align
 from flashdex.motions.checks_aligned import _check_left_out
 from flashdex.motions.jobs import Job, run_job
-from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.prepare import Order, hash_inputs, prepare, run_order
 from flashdex.motions.process import MotionSettings
@@ -20,6 +19,7 @@ from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.repair import repair
 from flashdex.motions.sources import SOURCES, list_recordings
 from flashdex.motions.sources.procedural import procedural
+from flashdex.objects.asset import ObjectSettings
 
 SMALL = ObjectSettings(sdf_resolution=24)
 

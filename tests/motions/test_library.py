@@ -15,7 +15,7 @@ from flashdex.errors import LibraryError
 from flashdex.motions import library_writer
 from flashdex.motions.library import FRAME_KEYS, MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.objects import ObjectSettings, make_object
+from flashdex.objects.asset import ObjectSettings, make_object
 
 SHAPES = {
     "joint_pos": (2, 18),
@@ -153,7 +153,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import test_library as t
 from flashdex.motions import library_writer
-from flashdex.motions.objects import ObjectSettings, make_object
+from flashdex.objects.asset import ObjectSettings, make_object
 import trimesh
 coarse = ObjectSettings(sdf_resolution=12)
 mesh = trimesh.creation.box((0.04, 0.05, 0.06))

@@ -18,18 +18,18 @@ from layouts.mano_files import write_mano
 from layouts.mutations import LAYOUTS, MANO_FILES, all_cases, write
 
 from flashdex.errors import FlashdexError
+from flashdex.hands.collision_spheres import HandModel
 from flashdex.motions import process
 from flashdex.motions.attempts import Attempt, Choice
 from flashdex.motions.checks import TRAVEL
-from flashdex.motions.hand_model import HandModel
 from flashdex.motions.jobs import prepare_recording
 from flashdex.motions.jumps import JUMP_SPEED
-from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.penetration import Penetration
 from flashdex.motions.prepare import prepare
 from flashdex.motions.process import MotionSettings, make_targets
 from flashdex.motions.recording import SourceOptions
 from flashdex.motions.sources import list_recordings
+from flashdex.objects.asset import ObjectSettings
 
 # writers of layouts compute with numbers that are none; that is not what is tested
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:layouts")

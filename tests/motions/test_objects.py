@@ -10,9 +10,9 @@ import pytest
 import trimesh
 
 from flashdex.errors import MeshError
-from flashdex.motions.meshes import clean_mesh, load_mesh, reduce_mesh
-from flashdex.motions.objects import ObjectSettings, default_cache_dir, make_object
-from flashdex.motions.signed_distance import winding_number
+from flashdex.objects.asset import ObjectSettings, default_cache_dir, make_object
+from flashdex.objects.meshes import clean_mesh, load_mesh, reduce_mesh
+from flashdex.objects.signed_distance import winding_number
 
 SMALL = ObjectSettings(sdf_resolution=24)
 SHARED = Path(
@@ -228,7 +228,7 @@ def assert_same(a, b):
 
 
 def test_cache_hit_is_identical_and_computes_nothing(ring, cache, monkeypatch):
-    monkeypatch.setattr("flashdex.motions.objects.clean_mesh", None)
+    monkeypatch.setattr("flashdex.objects.asset.clean_mesh", None)
     settings = ObjectSettings(sdf_resolution=32)
     assert_same(
         ring, make_object(torus(), settings=settings, cache_dir=cache, name="ring")

@@ -9,11 +9,11 @@ from flashdex.errors import DemoError, LibraryError, UnknownSourceError
 from flashdex.motions.checks import check_demo, status_of
 from flashdex.motions.demo import DemoObject
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.objects import ObjectSettings
 from flashdex.motions.prepare import prepare
 from flashdex.motions.process import MotionSettings, prepare_motion
 from flashdex.motions.sources.keypoints import read_keypoints
 from flashdex.motions.sources.procedural import procedural
+from flashdex.objects.asset import ObjectSettings
 
 QUICK = ObjectSettings(sdf_resolution=40)
 

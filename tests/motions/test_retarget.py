@@ -4,18 +4,17 @@ import pytest
 import torch
 
 from flashdex.hands.attach import add_hand
+from flashdex.hands.collision_spheres import make_spheres
+from flashdex.hands.jacobian import HandJacobian
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.align import align
-from flashdex.motions.hand_jacobian import HandJacobian
-from flashdex.motions.hand_spheres import make_spheres
-from flashdex.motions.objects import ObjectSettings, make_object
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.process import make_targets
 from flashdex.motions.retarget import Retargeter
-from flashdex.motions.solid import make_slot_grid
 from flashdex.motions.sources.procedural import procedural
+from flashdex.objects.asset import ObjectSettings, make_object, make_slot_grid
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,6 @@ from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.gaps import missing_frames
 from flashdex.motions.mano import load_mano, rotations_from_axis_angle
 from flashdex.motions.mano_files import mano_pair
-from flashdex.motions.meshes import load_mesh
 from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.sources.axis_angle import (
     part,
@@ -36,6 +35,7 @@ from flashdex.motions.sources.rigid import pose_track
 from flashdex.motions.sources.roots import refuse_clone, relative, require_folders
 from flashdex.motions.tracks import palm_frame, rotation
 from flashdex.motions.unpickle import load_npz
+from flashdex.objects.meshes import load_mesh
 
 FPS = 120.0
 SEQUENCES, TOOLS = "grab", "tools"

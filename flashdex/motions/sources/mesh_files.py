@@ -8,7 +8,7 @@ from pathlib import Path
 import trimesh
 
 from flashdex.errors import DemoError, MeshError
-from flashdex.motions.meshes import load_mesh
+from flashdex.objects.meshes import load_mesh
 
 SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 # names that exporters give the one mesh to look at in an object's own folder

@@ -18,13 +18,13 @@ from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.mano import load_mano, rotations_from_quats
-from flashdex.motions.meshes import hull_vertices, load_mesh
 from flashdex.motions.sources.oakink2_annotation import Annotation, read_annotation
 from flashdex.motions.sources.oakink2_files import OakInk2Sequence
 from flashdex.motions.sources.oakink2_program import Primitive, read_program
 from flashdex.motions.sources.roots import refuse_pointer, relative
 from flashdex.motions.support import estimate_support
 from flashdex.motions.tracks import palm_frame, transform_pose
+from flashdex.objects.meshes import hull_vertices, load_mesh
 
 FPS = 120.0
 SUPPORT_STRIDE = 4  # frames; 30 a second are enough to see what rests

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from flashdex.motions.meshes import join_meshes
+from flashdex.objects.meshes import join_meshes
 
 Approach = Literal["top", "side"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from flashdex.motions.signed_distance import surface_distance
+from flashdex.objects.signed_distance import surface_distance
 
 EQUAL = 0.10  # relative difference of two moments that may be equal
 FAR = 0.03  # of the width: a sample that turns farther off the surface tells

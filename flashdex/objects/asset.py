@@ -6,23 +6,79 @@ import hashlib
 import json
 import logging
 import os
+import zipfile
+import zlib
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from flashdex.motions.convex import compute_convex_parts, compute_mass_properties
-from flashdex.motions.meshes import (
+from flashdex.geometry.sdf import SdfGrid
+from flashdex.objects.convex import compute_convex_parts, compute_mass_properties
+from flashdex.objects.meshes import (
     clean_mesh,
+    join_meshes,
     load_mesh,
     reduce_mesh,
     sample_surface_points,
 )
-from flashdex.motions.object_cache import Values, read_cache, write_cache
-from flashdex.motions.signed_distance import make_distance_grid
-from flashdex.system.files import waiting_lock
+from flashdex.objects.signed_distance import make_distance_grid, surface_distance
+from flashdex.system.files import open_atomic, waiting_lock
+
+Values = dict[str, Any]  # field of ObjectAsset to its value
+
+SCALARS = ("radius", "sdf_spacing", "mass", "watertight")
+DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+def write_cache(file: Path, values: Values) -> None:
+    """Store the fields of an object as npz; a failure is logged and not fatal.
+
+    Args:
+        file: where; its directory is made.
+        values: arrays, numbers, and ``parts``, a list of (V, 3) arrays.
+    """
+    arrays: Values = {k: np.asarray(v) for k, v in values.items() if k != "parts"}
+    arrays["part_vertices"] = np.concatenate(values["parts"])
+    arrays["part_sizes"] = np.array([len(p) for p in values["parts"]])
+    try:
+        with open_atomic(file) as stream:
+            np.savez_compressed(stream, **arrays)
+    except OSError as error:
+        logger.warning("%s: object not cached (%s)", file, error)
+
+
+def read_cache(file: Path, *, required: set[str]) -> Values | None:
+    """Read what :func:`write_cache` stored.
+
+    Args:
+        file: the npz file.
+        required: fields that must be there.
+
+    Returns:
+        The fields, or None when the file is absent, damaged or of another layout.
+    """
+    if not file.is_file():
+        return None
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            values: Values = {k: stored[k] for k in stored.files}
+        cuts = np.cumsum(values.pop("part_sizes"))[:-1]
+        values["parts"] = np.split(values.pop("part_vertices"), cuts)
+        for scalar in SCALARS:
+            values[scalar] = values[scalar].item()
+        if set(values) != required:
+            raise KeyError(*sorted(required ^ set(values)))
+    except DAMAGED as error:
+        logger.warning("%s: unreadable (%s); computing the object again", file, error)
+        return None
+    return values
+
 
 logger = logging.getLogger(__name__)
 
@@ -239,3 +295,60 @@ def _compute(mesh: trimesh.Trimesh, settings: ObjectSettings, where: str) -> Val
         "visual_vertices": np.float32(visual.vertices),
         "visual_faces": np.asarray(visual.faces, dtype=np.int32),
     }
+
+
+# nodes farther from the mesh keep its distance: parts bulge by less, m
+BULGE = 0.03
+_known: dict[str, np.ndarray] = {}
+
+
+def make_slot_grid(assets: list[ObjectAsset], *, solid: bool) -> SdfGrid:
+    """Distance grids of a motion's objects in float64, row = slot.
+
+    Args:
+        assets: objects by slot.
+        solid: of mesh and convex parts together, instead of the mesh alone.
+    """
+    values = [solid_values(a) if solid else a.sdf for a in assets]
+    return SdfGrid(
+        torch.tensor(np.stack(values)).double(),
+        torch.tensor(np.stack([a.sdf_origin for a in assets])).double(),
+        torch.tensor([float(a.sdf_spacing) for a in assets]).double(),
+    )
+
+
+def solid_values(asset: ObjectAsset) -> np.ndarray:
+    """Signed distance to the union of a mesh and its convex parts at grid nodes.
+
+    Convex parts fill handles and hollows. Outside of all of them the distance is exact;
+    inside, it is the depth in the part one is deepest in, min_k max_i (n_i . p + d_i).
+
+    Args:
+        asset: the object.
+
+    Returns:
+        m, (R, R, R).
+    """
+    if asset.sha256 not in _known:
+        _known[asset.sha256] = _compute_solid(asset)
+    return _known[asset.sha256]
+
+
+def _compute_solid(asset: ObjectAsset) -> np.ndarray:
+    near = np.argwhere((asset.sdf > 0) & (asset.sdf < BULGE))
+    nodes = near * float(asset.sdf_spacing) + np.asarray(asset.sdf_origin, np.float64)
+    depth = np.full(len(nodes), np.inf)
+    hulls = []
+    for part in asset.parts:
+        hull = ConvexHull(np.asarray(part, float))
+        planes = nodes @ hull.equations[:, :3].T + hull.equations[:, 3]
+        depth = np.minimum(depth, planes.max(axis=1))
+        hulls.append(trimesh.Trimesh(hull.points, hull.simplices, process=False))
+    mesh = join_meshes(hulls)
+    outside = depth > 0
+    step = float(asset.sdf_spacing)
+    depth[outside] = surface_distance(mesh, nodes[outside], step=step)
+    values = asset.sdf.copy()
+    index = tuple(near.T)
+    values[index] = np.minimum(values[index], depth)
+    return values

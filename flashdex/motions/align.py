@@ -8,6 +8,14 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import (
+    continuous,
+    resample,
+    resample_pose,
+    sample_times,
+    transform_pose,
+)
 from flashdex.keys import SIDES
 from flashdex.motions.contacts import (
     NO_OBJECT,
@@ -15,16 +23,8 @@ from flashdex.motions.contacts import (
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.support import estimate_support
-from flashdex.motions.tracks import (
-    continuous,
-    resample,
-    resample_pose,
-    sample_times,
-    transform_pose,
-)
 from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 # turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from flashdex.motions.demo import HumanDemo
+from flashdex.datasets.demo import HumanDemo
 from flashdex.motions.jumps import jump_steps
 
 Level = Literal["info", "warn", "reject"]

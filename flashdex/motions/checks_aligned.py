@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
+from flashdex.datasets.tracks import rotation, runs
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.keys import TIP_KEYPOINTS
 from flashdex.motions.activity import MOVE_TRAVEL, MOVE_TURN, motion_of
@@ -15,8 +16,7 @@ from flashdex.motions.checks import Finding, reject
 from flashdex.motions.checks_objects import check_objects, check_overlap
 from flashdex.motions.gravity import Up, check_up
 from flashdex.motions.penetration import Penetration
-from flashdex.motions.support import lowest_points, runs, still_runs
-from flashdex.motions.tracks import rotation
+from flashdex.motions.support import lowest_points, still_runs
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import linear_velocity, rotation
 from flashdex.keys import Side
 from flashdex.motions.align import AlignedDemo
 from flashdex.motions.checks import Finding, reject
-from flashdex.motions.demo import HumanDemo
-from flashdex.motions.tracks import linear_velocity, rotation
 
 # where index to pinky begin and end
 KNUCKLES, TIPS = [5, 9, 13, 17], [8, 12, 16, 20]

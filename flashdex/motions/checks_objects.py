@@ -9,9 +9,9 @@ import torch
 import trimesh
 from scipy.spatial import ConvexHull
 
+from flashdex.datasets.tracks import rotation
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.motions.checks import Finding, reject
-from flashdex.motions.tracks import rotation
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.symmetry import revolution_axis
 

@@ -6,9 +6,8 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_closing, uniform_filter1d
 
+from flashdex.datasets.tracks import rotation, runs
 from flashdex.keys import TIP_KEYPOINTS
-from flashdex.motions.support import runs
-from flashdex.motions.tracks import rotation
 from flashdex.objects.signed_distance import surface_distance
 
 CONTACT_DISTANCE = 0.015  # m

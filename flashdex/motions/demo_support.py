@@ -5,11 +5,10 @@ from __future__ import annotations
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import missing_frames, runs, transform_pose
 from flashdex.motions.align import UP_ROTATION
-from flashdex.motions.demo import HumanDemo
-from flashdex.motions.gaps import missing_frames
-from flashdex.motions.support import estimate_support, runs
-from flashdex.motions.tracks import transform_pose
+from flashdex.motions.support import estimate_support
 from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 

@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.tracks import rotation
 from flashdex.motions.align import UP_ROTATION
 from flashdex.motions.checks import Finding
 from flashdex.motions.support import still_runs
-from flashdex.motions.tracks import rotation
 
 Up = Literal["z", "y", "-y"]
 

@@ -13,12 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.source import Recording
 from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions.checks import MAX_SECONDS, Finding, concerning
-from flashdex.motions.demo import HumanDemo
 from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
 from flashdex.motions.process import MotionSettings, Prepared, prepare_motion, reject
-from flashdex.motions.recording import Recording
 from flashdex.motions.repair import repair
 from flashdex.motions.segment import segment
 

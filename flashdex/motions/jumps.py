@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flashdex.motions.tracks import rotation
+from flashdex.datasets.tracks import rotation
 
 JUMP_SPEED, JUMP_TURN, JUMP_STEP = 5.0, 30.0, 0.03  # m/s, rad/s, m
 JUMP_RATIO = 6.0  # of the usual step around a frame

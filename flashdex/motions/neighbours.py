@@ -6,8 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
-from flashdex.motions.gaps import missing_frames
-from flashdex.motions.tracks import rotation
+from flashdex.datasets.tracks import missing_frames, rotation
 
 CONTACT = 0.01  # m between surfaces
 SPACING = 0.005  # m between the samples of a surface

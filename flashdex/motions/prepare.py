@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from flashdex.datasets import list_recordings
+from flashdex.datasets.source import Recording, SourceOptions
 from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
 from flashdex.motions.jobs import Job, Outcome
@@ -23,9 +25,7 @@ from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.motion_cache import cache_file, content_hash
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.process import MotionSettings
-from flashdex.motions.recording import Recording, SourceOptions
 from flashdex.motions.residuals import RetargetWeights
-from flashdex.motions.sources import list_recordings
 from flashdex.objects.asset import ObjectSettings
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
@@ -81,7 +81,7 @@ def prepare(
     cache: an interrupted preparation goes on where it was.
 
     Args:
-        source: name of a reader, see ``flashdex.motions.sources.SOURCES``.
+        source: name of a reader, see ``flashdex.datasets.SOURCES``.
         input: what it reads, mostly the dataset's folder.
         hand: robot hand.
         out: directory of the library; an older library there is replaced at the end.

@@ -11,6 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import angular_velocity, linear_velocity
 from flashdex.errors import DemoError, MeshError
 from flashdex.geometry.rotation import quat_mul, quat_rotate
 from flashdex.hands.collision_spheres import HandModel
@@ -22,14 +24,12 @@ from flashdex.motions.checks import Finding, check_demo, make_strict, status_of
 from flashdex.motions.checks_aligned import check_aligned, check_retarget
 from flashdex.motions.checks_hands import check_company, check_sides
 from flashdex.motions.contacts import NO_OBJECT, blend
-from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.residuals import RetargetWeights, Targets
 from flashdex.motions.retarget import Retargeter
 from flashdex.motions.support import support_disks
-from flashdex.motions.tracks import angular_velocity, linear_velocity
 from flashdex.objects.asset import (
     ObjectAsset,
     ObjectSettings,

@@ -11,6 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flashdex.datasets.demo import QUAT_TOLERANCE, DemoObject, HumanDemo
+from flashdex.datasets.tracks import (
+    FARTHEST,
+    align_signs,
+    fill_points,
+    fill_pose,
+    missing_frames,
+    runs,
+    short_gaps,
+)
 from flashdex.errors import MeshError
 from flashdex.keys import Side
 from flashdex.motions.checks import (
@@ -21,18 +31,8 @@ from flashdex.motions.checks import (
     Finding,
     reject,
 )
-from flashdex.motions.demo import QUAT_TOLERANCE, DemoObject, HumanDemo
 from flashdex.motions.demo_support import demo_support
-from flashdex.motions.gaps import (
-    align_signs,
-    fill_points,
-    fill_pose,
-    missing_frames,
-    short_gaps,
-)
 from flashdex.motions.jumps import outliers
-from flashdex.motions.support import runs
-from flashdex.motions.tracks import FARTHEST
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation
 LEAST_TRACKED = 0.2  # share of frames below which a track is not worth keeping

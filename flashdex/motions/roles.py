@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flashdex.datasets.demo import HumanDemo
 from flashdex.keys import Side
 from flashdex.motions.activity import (
     MOVE_TRAVEL,
@@ -14,7 +15,6 @@ from flashdex.motions.activity import (
     Activity,
     motion_of,
 )
-from flashdex.motions.demo import HumanDemo
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.neighbours import Surfaces
 

@@ -9,6 +9,8 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.tracks import missing_frames, runs
 from flashdex.errors import MeshError
 from flashdex.keys import Side
 from flashdex.motions.activity import (
@@ -24,13 +26,10 @@ from flashdex.motions.checks import (
     Finding,
     reject,
 )
-from flashdex.motions.demo import HumanDemo
 from flashdex.motions.demo_support import demo_support
-from flashdex.motions.gaps import missing_frames
 from flashdex.motions.neighbours import Surfaces
 from flashdex.motions.repair import keep
 from flashdex.motions.roles import Use, find_use
-from flashdex.motions.support import runs
 from flashdex.objects.meshes import clean_mesh
 
 MARGIN_SECONDS = 0.33

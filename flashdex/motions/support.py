@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flashdex.motions.tracks import angular_velocity, linear_velocity, rotation
+from flashdex.datasets.tracks import angular_velocity, linear_velocity, rotation, runs
 
 STILL_SPEED = 0.03  # m/s
 STILL_TURN = 0.3  # rad/s
@@ -27,13 +27,6 @@ def still_runs(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
     turn = np.linalg.norm(angular_velocity(pose[:, 3:], fps, sigma=1.0), axis=-1)
     least = max(int(np.ceil(STILL_SECONDS * fps)), 2)
     return runs((speed < STILL_SPEED) & (turn < STILL_TURN), least=least)
-
-
-def runs(mask: np.ndarray, *, least: int = 1) -> list[tuple[int, int]]:
-    """Maximal runs of True in ``mask`` (T,) of at least ``least`` frames."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-    return [(a, b) for a, b in pairs if b - a >= least]
 
 
 def lowest_points(pose: np.ndarray, vertices: np.ndarray) -> np.ndarray:

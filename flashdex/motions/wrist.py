@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from flashdex.motions.tracks import rotation
+from flashdex.datasets.tracks import rotation
 
 
 def unwrap_wrist(quats: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ SourceName = Literal[
     "spider",
     "fdr",
 ]
-"""Readers of recordings; `flashdex.motions.sources.SOURCES` has the same names."""
+"""Readers of recordings; `flashdex.datasets.SOURCES` has the same names."""
 
 
 @dataclass(frozen=True, kw_only=True)

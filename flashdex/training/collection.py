@@ -11,11 +11,11 @@ from pathlib import Path
 
 import torch
 
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError, FlashdexError, LibraryError
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.prepare import Order, hash_inputs, run_order
 from flashdex.motions.process import MotionSettings
-from flashdex.motions.recording import SourceOptions
 from flashdex.recipe import Recipe
 
 _LOG = logging.getLogger(__name__)

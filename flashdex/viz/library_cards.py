@@ -9,9 +9,9 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from flashdex.datasets.tracks import runs
 from flashdex.keys import FINGERS, SIDES
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.support import runs
 from flashdex.viz.html import Html, number, tag
 from flashdex.viz.library_facts import RecordingFacts
 from flashdex.viz.library_thumbs import contact_of, frames_of, still_frames

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from flashdex.motions.demo import DemoObject, HumanDemo
-from flashdex.motions.sources.human_hand import GRASP, hand_keypoints
-from flashdex.motions.tracks import palm_frame
+from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
+from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.tracks import palm_frame
 
 REPOSITORY = Path(__file__).parents[2]
 

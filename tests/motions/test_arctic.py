@@ -9,10 +9,10 @@ from layouts.arctic import expected_vertices, write
 from layouts.mano_files import mano_hand, write_mano
 from layouts.scene import make_scene
 
+from flashdex.datasets.arctic import list_arctic
+from flashdex.datasets.source import SourceOptions
+from flashdex.datasets.tracks import rotation
 from flashdex.errors import DemoError
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.arctic import list_arctic
-from flashdex.motions.tracks import rotation
 
 FRAMES = 48
 

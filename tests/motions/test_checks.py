@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.procedural.reader import procedural
 from flashdex.motions.align import align
 from flashdex.motions.checks import Finding, make_strict, status_of
 from flashdex.motions.checks_aligned import check_aligned
@@ -12,7 +13,6 @@ from flashdex.motions.checks_objects import check_objects, check_overlap
 from flashdex.motions.contacts import tip_distances
 from flashdex.motions.gravity import check_up
 from flashdex.motions.jumps import outliers
-from flashdex.motions.sources.procedural import procedural
 from flashdex.objects.asset import (
     ObjectAsset,
     ObjectSettings,

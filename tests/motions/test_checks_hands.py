@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flashdex.datasets.demo import DemoObject
+from flashdex.datasets.fields import number, numbers, word
+from flashdex.datasets.keypoints import read_keypoints
+from flashdex.datasets.procedural.reader import procedural
+from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
 from flashdex.motions.checks import check_demo
 from flashdex.motions.checks_hands import check_company, check_sides
-from flashdex.motions.demo import DemoObject
 from flashdex.motions.repair import repair
-from flashdex.motions.sources.entries import number, numbers, word
-from flashdex.motions.sources.keypoints import read_keypoints
-from flashdex.motions.sources.procedural import procedural
-from flashdex.motions.tracks import palm_frame
 
 
 @pytest.fixture

@@ -16,18 +16,18 @@ from layouts import arctic, fdr, grab, hot3d, oakink2, spider, taco
 from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
+from flashdex.datasets.arctic import ARCTIC
+from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.fdr.reader import FDR
+from flashdex.datasets.grab import GRAB
+from flashdex.datasets.hot3d.reader import HOT3D
+from flashdex.datasets.keypoints import KEYPOINTS
+from flashdex.datasets.oakink2.reader import OAKINK2
+from flashdex.datasets.source import Source, SourceOptions
+from flashdex.datasets.spider.reader import SPIDER
+from flashdex.datasets.taco.reader import TACO
+from flashdex.datasets.tracks import palm_frame
 from flashdex.motions.align import UP_ROTATION
-from flashdex.motions.demo import DemoObject, HumanDemo
-from flashdex.motions.recording import Source, SourceOptions
-from flashdex.motions.sources.arctic import ARCTIC
-from flashdex.motions.sources.fdr import FDR
-from flashdex.motions.sources.grab import GRAB
-from flashdex.motions.sources.hot3d import HOT3D
-from flashdex.motions.sources.keypoints import KEYPOINTS
-from flashdex.motions.sources.oakink2 import OAKINK2
-from flashdex.motions.sources.spider import SPIDER
-from flashdex.motions.sources.taco import TACO
-from flashdex.motions.tracks import palm_frame
 
 SECONDS = 2.0
 COMMON = 10.0  # Hz, the times that every rate has

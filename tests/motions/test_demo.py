@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flashdex.datasets.demo import HumanDemo
 from flashdex.errors import DemoError
-from flashdex.motions.demo import HumanDemo
 
 
 def test_sound_demo_is_accepted(still_demo):

@@ -8,9 +8,9 @@ import torch
 from layouts.fdr import matrices, write, write_pack
 from layouts.scene import make_scene
 
+from flashdex.datasets.fdr.reader import list_fdr
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.fdr import list_fdr
 
 FRAMES = 108
 

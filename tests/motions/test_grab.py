@@ -8,9 +8,9 @@ from layouts.grab import write
 from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
+from flashdex.datasets.grab import list_grab
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.grab import list_grab
 
 FRAMES = 144
 

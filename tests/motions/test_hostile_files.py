@@ -12,19 +12,18 @@ import trimesh
 
 import flashdex
 from flashdex.cli import main
+from flashdex.datasets import list_recordings
+from flashdex.datasets.fetch import fetch
+from flashdex.datasets.hot3d.files import Track, frame_axis
+from flashdex.datasets.procedural.reader import procedural
+from flashdex.datasets.source import Recording, SourceOptions
+from flashdex.datasets.spider.scene import known_files, read_objects
+from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions import motion_cache
-from flashdex.motions.fetch import fetch
 from flashdex.motions.jobs import Job, run_job
 from flashdex.motions.library_writer import LibraryWriter, _unique_names
 from flashdex.motions.process import MotionSettings
-from flashdex.motions.recording import Recording, SourceOptions
-from flashdex.motions.sources import list_recordings
-from flashdex.motions.sources.hot3d_files import Track
-from flashdex.motions.sources.hot3d_time import frame_axis
-from flashdex.motions.sources.procedural import procedural
-from flashdex.motions.sources.spider_scene import known_files, read_objects
-from flashdex.motions.tracks import palm_frame
 from flashdex.objects import meshes
 from flashdex.objects.asset import ObjectSettings, make_object
 from flashdex.objects.meshes import load_mesh

@@ -12,11 +12,10 @@ from layouts.umetrack import UMETRACK_SHIFT, umetrack_keypoints
 from scipy.spatial.transform import Rotation
 from trimesh.proximity import closest_point
 
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.hot3d import list_hot3d
-from flashdex.motions.sources.hot3d_files import Mask, Track
-from flashdex.motions.sources.hot3d_time import frame_axis
-from flashdex.motions.umetrack import load_umetrack
+from flashdex.datasets.body_models.umetrack import load_umetrack
+from flashdex.datasets.hot3d.files import Mask, Track, frame_axis
+from flashdex.datasets.hot3d.reader import list_hot3d
+from flashdex.datasets.source import SourceOptions
 from flashdex.objects.meshes import load_mesh
 
 NAME = "P0003_c701bd11"

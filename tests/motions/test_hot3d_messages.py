@@ -7,9 +7,9 @@ from layouts.hot3d import write
 from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
+from flashdex.datasets.hot3d.reader import list_hot3d
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.hot3d import list_hot3d
 
 NAME = "P0003_c701bd11"
 FRAMES = 48

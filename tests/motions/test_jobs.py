@@ -8,6 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
+from flashdex.datasets import SOURCES, list_recordings
+from flashdex.datasets.procedural.reader import procedural
+from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
 from flashdex.motions.checks_aligned import _check_left_out
@@ -15,10 +18,7 @@ from flashdex.motions.jobs import Job, run_job
 from flashdex.motions.pool import run_jobs
 from flashdex.motions.prepare import Order, hash_inputs, prepare, run_order
 from flashdex.motions.process import MotionSettings
-from flashdex.motions.recording import Recording, Source, SourceOptions
 from flashdex.motions.repair import repair
-from flashdex.motions.sources import SOURCES, list_recordings
-from flashdex.motions.sources.procedural import procedural
 from flashdex.objects.asset import ObjectSettings
 
 SMALL = ObjectSettings(sdf_resolution=24)

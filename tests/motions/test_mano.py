@@ -9,13 +9,13 @@ from layouts.reference_fk import rodrigues, shaped, skin_frame, wrist_keypoints
 from layouts.scene import BETAS, make_scene
 from scipy.spatial.transform import Rotation
 
-from flashdex.errors import DemoError
-from flashdex.motions.mano import (
+from flashdex.datasets.body_models.mano import (
     load_mano,
     mano_file,
     rotations_from_axis_angle,
     rotations_from_quats,
 )
+from flashdex.errors import DemoError
 
 SIDES = ("left", "right")
 FRAMES = 5

@@ -17,6 +17,8 @@ from layouts.faulty_scenes import scale_poses, spoil_objects, swap_sides
 from layouts.mano_files import write_mano
 from layouts.mutations import LAYOUTS, MANO_FILES, all_cases, write
 
+from flashdex.datasets import list_recordings
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import FlashdexError
 from flashdex.hands.collision_spheres import HandModel
 from flashdex.motions import process
@@ -27,8 +29,6 @@ from flashdex.motions.jumps import JUMP_SPEED
 from flashdex.motions.penetration import Penetration
 from flashdex.motions.prepare import prepare
 from flashdex.motions.process import MotionSettings, make_targets
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources import list_recordings
 from flashdex.objects.asset import ObjectSettings
 
 # writers of layouts compute with numbers that are none; that is not what is tested

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from layouts.myodm import BONE, FRAMES, PALM, write_wheel
 
+from flashdex.datasets import fetch as fetching
+from flashdex.datasets.body_models.myohand import myohand_keypoints
+from flashdex.datasets.fetch import UnknownDatasetError, fetch, myodm_dir
+from flashdex.datasets.myodm import list_myodm, read_clip
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
-from flashdex.motions import fetch as fetching
-from flashdex.motions.fetch import UnknownDatasetError, fetch, myodm_dir
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.myodm import list_myodm, read_clip
-from flashdex.motions.sources.myohand import myohand_keypoints
 
 
 @pytest.fixture

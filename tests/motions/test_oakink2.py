@@ -12,11 +12,11 @@ from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 from layouts.taco import matrices
 
+from flashdex.datasets.oakink2.annotation import parse_intervals
+from flashdex.datasets.oakink2.reader import OAKINK2
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.oakink2 import OAKINK2
-from flashdex.motions.sources.oakink2_program import parse_intervals
 
 BOX, BLOCK = layout.IDS
 FRAMES = 240

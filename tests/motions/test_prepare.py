@@ -5,14 +5,14 @@ import pytest
 import torch
 import trimesh
 
+from flashdex.datasets.demo import DemoObject
+from flashdex.datasets.keypoints import read_keypoints
+from flashdex.datasets.procedural.reader import procedural
 from flashdex.errors import DemoError, LibraryError, UnknownSourceError
 from flashdex.motions.checks import check_demo, status_of
-from flashdex.motions.demo import DemoObject
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.prepare import prepare
 from flashdex.motions.process import MotionSettings, prepare_motion
-from flashdex.motions.sources.keypoints import read_keypoints
-from flashdex.motions.sources.procedural import procedural
 from flashdex.objects.asset import ObjectSettings
 
 QUICK = ObjectSettings(sdf_resolution=40)
@@ -284,7 +284,7 @@ def test_recorded_tip_distances_are_met(demos):
 
 
 def test_recorded_palms_are_met(demos):
-    from flashdex.motions.tracks import palm_frame
+    from flashdex.datasets.tracks import palm_frame
 
     with np.load(demos / "manipnet" / "mug1.npz") as data:
         for side in ("left", "right"):

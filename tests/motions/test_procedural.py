@@ -2,23 +2,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flashdex.errors import UnknownSourceError
-from flashdex.keys import SIDES
-from flashdex.motions.contacts import tip_distances
-from flashdex.motions.sources.human_hand import (
+from flashdex.datasets.body_models.human_hand import (
     LOWER,
     PHALANGES,
     THUMB_BONES,
     UPPER,
     hand_keypoints,
 )
-from flashdex.motions.sources.procedural import (
+from flashdex.datasets.procedural.reader import (
     KINDS,
     NOISE_POINT,
     QUICKSTART,
     procedural,
     smooth_noise,
 )
+from flashdex.errors import UnknownSourceError
+from flashdex.keys import SIDES
+from flashdex.motions.contacts import tip_distances
 from flashdex.motions.support import lowest_points
 
 SINGLE = [k for k in KINDS if k.startswith("pick") and k.endswith("right")]

@@ -5,11 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
+from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.tracks import palm_frame
 from flashdex.motions.checks import check_demo, concerning, make_strict, status_of
-from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.repair import repair
-from flashdex.motions.sources.human_hand import GRASP, hand_keypoints
-from flashdex.motions.tracks import palm_frame
 
 FPS = 30.0
 ASIDE = np.array([0, 0.3, 0])
@@ -240,7 +240,7 @@ def test_findings_of_a_piece(demo):
 
 
 def test_recordings_are_left_alone(demos):
-    from flashdex.motions.sources.keypoints import read_file
+    from flashdex.datasets.keypoints import read_file
 
     for file in sorted((demos / "myodm").glob("*.npz")):
         recording = read_file(file)
@@ -250,7 +250,7 @@ def test_recordings_are_left_alone(demos):
 
 
 def test_whisking_jumps(demos):
-    from flashdex.motions.sources.keypoints import read_file
+    from flashdex.datasets.keypoints import read_file
 
     (out,), _ = repair(read_file(demos / "do_as_i_do" / "whisking.npz"))
     assert "W_JUMP" in [f.code for f in check_demo(out)]

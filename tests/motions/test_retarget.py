@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch
 
+from flashdex.datasets.procedural.reader import procedural
 from flashdex.hands.attach import add_hand
 from flashdex.hands.collision_spheres import make_spheres
 from flashdex.hands.jacobian import HandJacobian
@@ -13,7 +14,6 @@ from flashdex.motions.align import align
 from flashdex.motions.penetration import make_reference_scene, measure_penetration
 from flashdex.motions.process import make_targets
 from flashdex.motions.retarget import Retargeter
-from flashdex.motions.sources.procedural import procedural
 from flashdex.objects.asset import ObjectSettings, make_object, make_slot_grid
 
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.motions.activity import nearest_tips, touches
 from flashdex.motions.checks import check_demo, concerning, status_of
 from flashdex.motions.contacts import tip_distances
-from flashdex.motions.demo import DemoObject, HumanDemo
 from flashdex.motions.repair import repair
 from flashdex.motions.segment import segment
 
@@ -308,7 +308,7 @@ def test_a_hundred_seconds_with_dense_meshes_are_cut():
 
 
 def test_recordings_are_cut_near_the_human_reference(demos):
-    from flashdex.motions.sources.keypoints import read_file
+    from flashdex.datasets.keypoints import read_file
 
     (demo,), _ = repair(read_file(demos / "manipnet" / "mug1.npz"))
     pieces, _ = segment(demo)

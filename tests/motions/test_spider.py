@@ -8,12 +8,12 @@ from layouts.scene import make_scene
 from layouts.spider import TIPS, write
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.body_models.human_hand import GRASP, OPEN, hand_keypoints
+from flashdex.datasets.source import SourceOptions
+from flashdex.datasets.spider.hand import fill_hand, pose_hand
+from flashdex.datasets.spider.reader import list_spider
+from flashdex.datasets.tracks import palm_frame, rotation
 from flashdex.errors import DemoError
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.human_hand import GRASP, OPEN, hand_keypoints
-from flashdex.motions.sources.spider import list_spider
-from flashdex.motions.sources.spider_hand import fill_hand, pose_hand
-from flashdex.motions.tracks import palm_frame, rotation
 
 QUARTER = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 

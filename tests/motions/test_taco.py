@@ -10,11 +10,11 @@ from layouts import taco as layout
 from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
+from flashdex.datasets.source import SourceOptions
+from flashdex.datasets.taco.reader import TACO
+from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
-from flashdex.motions.recording import SourceOptions
-from flashdex.motions.sources.taco import TACO
-from flashdex.motions.tracks import palm_frame
 
 HANDS = f"Hand_Poses/{layout.TRIPLET}/{layout.SEQUENCE}"
 OBJECTS = f"Object_Poses/{layout.TRIPLET}/{layout.SEQUENCE}"

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flashdex.motions.sources.human_hand import GRASP, hand_keypoints
-from flashdex.motions.tracks import (
+from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
+from flashdex.datasets.tracks import (
     angular_velocity,
     continuous,
     linear_velocity,

@@ -17,15 +17,15 @@ import scipy.sparse as sp
 import torch
 from layouts.mano_files import mano_hand, write_mano
 
-from flashdex.errors import DemoError
-from flashdex.motions import unpickle
-from flashdex.motions.stand_ins.tensors import MAGIC, STORAGES, VERSION
-from flashdex.motions.unpickle import (
+from flashdex.datasets import pickles as unpickle
+from flashdex.datasets.pickles import (
     load_npz,
     load_object_array,
     load_pickle,
     load_torch,
 )
+from flashdex.datasets.stand_ins.tensors import MAGIC, STORAGES, VERSION
+from flashdex.errors import DemoError
 
 PROTOCOLS = range(6)
 

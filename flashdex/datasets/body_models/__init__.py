@@ -1,0 +1,1 @@
+"""Hand models that data sets record parameters of: MANO, UmeTrack, MyoHand."""

@@ -1,0 +1,1 @@
+"""Files of FlashDexRetarget: npz clips and packs of motions."""

@@ -1,0 +1,1 @@
+"""HOT3D: sessions of Aria and Quest 3."""

@@ -1,0 +1,154 @@
+"""The world of a HOT3D sequence: which headset recorded it and which axis is up."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from flashdex.datasets.hot3d.files import BROKEN_JSON, read_lines
+from flashdex.errors import DemoError
+
+Up = Literal["z", "y"]
+# Aria: origin near the first headset position; Quest: origin on the floor
+UP_OF: dict[str, Up] = {"aria": "z", "quest": "y"}
+TEST_PARTICIPANTS = ("P0004", "P0005", "P0006", "P0008", "P0016", "P0020")
+MIN_HEAD_HEIGHT = 0.05  # of the headset above the objects, m
+# how much flatter the objects must lie along another axis to make the first one wrong
+FLATTER = 3.0
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What ``metadata.json`` says, in either of its two layouts.
+
+    Args:
+        headset: ``Aria``, ``Quest3``.
+        participant: such as ``P0003``.
+        truth: whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a
+            kind of which nothing is said is missing here.
+        names: of the objects, by uid, where they are listed.
+        version: of the dataset, where it is given.
+    """
+
+    headset: str
+    participant: str
+    truth: dict[str, bool] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
+    version: str = ""
+
+
+def read_metadata(file: Path) -> Metadata:
+    """``metadata.json``, old and new layout.
+
+    Raises:
+        DemoError: the file is missing or not of this kind.
+    """
+    try:
+        data = json.loads("\n".join(read_lines(file)))
+        uids, names = data.get("object_uids") or [], data.get("object_names") or []
+        return Metadata(
+            headset=str(data.get("headset", "")),
+            participant=str(data.get("participant_id", "")),
+            truth=_truth(data),
+            names={str(u): str(n) for u, n in zip(uids, names, strict=False)},
+            version=next((str(v) for k, v in data.items() if "version" in k), ""),
+        )
+    except BROKEN_JSON as error:
+        raise DemoError(
+            f"{file}: not the metadata of a HOT3D sequence: {error!r}. Expected JSON "
+            f"with 'headset' and 'participant_id'."
+        ) from error
+
+
+def _truth(data: dict[str, Any]) -> dict[str, bool]:
+    keys = {
+        "objects": "object_pose_gt",
+        "mano": "mano_hand_pose_gt",
+        "umetrack": "umetrack_hand_pose_gt",
+    }
+    if "have_hand_object_pose_gt" in data:
+        return dict.fromkeys(keys, bool(data["have_hand_object_pose_gt"]))
+    status = dict(data.get("gt_available_status") or {})
+    return {kind: bool(status[key]) for kind, key in keys.items() if key in status}
+
+
+def refuse_without_truth(folder: Path, metadata: Metadata, hands: str) -> None:
+    """Refuse a sequence whose poses were not published.
+
+    Args:
+        folder: of the sequence.
+        metadata: of it.
+        hands: the kind of hand poses that is wanted, ``mano`` or ``umetrack``.
+
+    Raises:
+        DemoError: says which poses are missing.
+    """
+    kinds = {"objects": "object poses", hands: f"{hands} hand poses"}
+    missing = [
+        text for kind, text in kinds.items() if not metadata.truth.get(kind, True)
+    ]
+    is_test = metadata.participant in TEST_PARTICIPANTS
+    if is_test and not (folder / "dynamic_objects.csv").is_file():
+        missing = missing or list(kinds.values())
+    if missing:
+        test = f"{metadata.participant} belongs to the test set" if is_test else ""
+        raise DemoError(
+            f"{folder.name}: skipped, it has no ground truth for "
+            f"{' and '.join(missing)}{'; ' + test if test else ''}. Nothing is wrong "
+            f"with the download."
+        )
+
+
+def up_axis(
+    name: str, headset: str, head: np.ndarray, objects: list[np.ndarray]
+) -> tuple[Up, dict[str, Any]]:
+    """The axis that points up: by the headset, verified with the data.
+
+    The headset must be above the objects. Where the other axis puts the headset higher
+    and at the same time finds the objects lying much flatter, the metadata is wrong.
+
+    Args:
+        name: of the sequence, for messages.
+        headset: of the metadata.
+        head: positions of the headset, m, world, (T, 3); empty if not known.
+        objects: positions of each object, m, world, (T, 3).
+
+    Returns:
+        The axis, and what was measured.
+
+    Raises:
+        DemoError: another headset, or the data contradict it.
+    """
+    kind = next((kind for kind in UP_OF if headset.lower().startswith(kind)), None)
+    if kind is None:
+        raise DemoError(
+            f"{name}: metadata.json names the headset '{headset}'; allowed: Aria "
+            f"(z up), Quest3 (y up). The up axis depends on it."
+        )
+    up = UP_OF[kind]
+    middles = [_middle(points) for points in (head, *objects)]
+    centres = np.array([middle for middle in middles[1:] if middle is not None])
+    if middles[0] is None or not len(centres):
+        return up, {"up_check": "by the headset's name only: no headset trajectory"}
+    height = middles[0] - np.median(centres, axis=0)
+    spread = np.ptp(centres, axis=0)
+    axis, other = ("xyz".index(up), "xyz".index("y" if up == "z" else "z"))
+    flatter = len(centres) > 1 and spread[other] * FLATTER < spread[axis]
+    if height[axis] < MIN_HEAD_HEIGHT or (height[other] > height[axis] and flatter):
+        raise DemoError(
+            f"{name}: {headset} means {up} up, but along {up} the headset is "
+            f"{height[axis]:.2f} m above the objects, which spread {spread[axis]:.2f} "
+            f"m; along {'xyz'[other]} it is {height[other]:.2f} m and "
+            f"{spread[other]:.2f} m. Check 'headset' in metadata.json."
+        )
+    return up, {"headset_above_objects_m": round(float(height[axis]), 3)}
+
+
+def _middle(points: np.ndarray) -> np.ndarray | None:
+    """Median of the finite rows of (N, 3); None without any."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return np.median(finite, axis=0) if len(finite) else None

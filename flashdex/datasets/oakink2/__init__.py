@@ -1,0 +1,1 @@
+"""OakInk2: annotated sequences cut at their primitives."""

@@ -1,0 +1,1 @@
+"""Made-up motions: a hand carries a shape."""

@@ -1,0 +1,169 @@
+"""One hand carries one object: grasp, approach, lift, move, turn, place, retreat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from flashdex.datasets.body_models.human_hand import (
+    FINGER_RADIUS,
+    OPEN,
+    Grasp,
+    GraspTarget,
+    fit_grasp,
+)
+from flashdex.datasets.procedural.shapes import Shape
+
+# nominal durations, s
+APPROACH, CLOSE, CARRY, RELEASE, RETREAT = 0.55, 0.30, 1.30, 0.25, 0.40
+# how far the hand is away at the beginning and the end, m
+STANDOFF = 0.10
+# palm inclination against the grasp axis, rad: fingers point downwards or around
+PALM_TILT = {"top": np.deg2rad(38), "side": np.deg2rad(35)}
+FINGER_PITCH = 0.020
+GAP = (0.003, 0.006)  # m, of the tips to the surface while grasping
+OPENING = 0.5
+
+
+@dataclass
+class CarryPlan:
+    """What happens to the object.
+
+    Args:
+        start: where it stands, m, (2,).
+        move: horizontal displacement, m, (2,).
+        lift: highest point of the carry above the start, m.
+        turn: rotation about z between start and end, rad.
+        tilt: largest inclination in mid carry, rad.
+        yaw: direction of the grasp axis (thumb to fingers) in the world, rad.
+        speed: 1 is the nominal pace.
+    """
+
+    start: np.ndarray
+    move: np.ndarray
+    lift: float
+    turn: float
+    tilt: float
+    yaw: float
+    speed: float
+
+
+@dataclass
+class Track:
+    """Keypoints (T, 21, 3) of a right hand and the object's pose, world."""
+
+    keypoints: np.ndarray
+    object_pos: np.ndarray
+    object_rot: Rotation
+
+    def mirrored(self, mirror: np.ndarray) -> Track:
+        """The motion seen in a mirror, S = diag(mirror): p' = S p, R' = S R S."""
+        matrix = self.object_rot.as_matrix() * mirror[:, None] * mirror[None, :]
+        rot = Rotation.from_matrix(matrix)
+        return Track(self.keypoints * mirror, self.object_pos * mirror, rot)
+
+
+def carry_track(
+    shape: Shape, plan: CarryPlan, rng: np.random.Generator, *, fps: float
+) -> Track:
+    """Noise-free motion of a right hand that carries ``shape`` as planned."""
+    grasp = fit_grasp(grasp_target(shape, rng))
+    ends = np.cumsum([APPROACH, CLOSE, CARRY, RELEASE, RETREAT]) * plan.speed
+    times = np.arange(int(ends[-1] * fps) + 1) / fps
+    rest = -shape.mesh.bounds[0, 2]
+    pos, rot = _object_path(plan, times, ends, rest)
+    opening = 1 - smooth(times, ends[0] - 0.10, ends[1] - 0.02)
+    opening = opening + smooth(times, ends[2] + 0.02, ends[3] + 0.08)
+    away = 1 - smooth(times, 0.0, ends[0]) + smooth(times, ends[3], ends[4])
+    local = _hand_path(grasp, shape, opening, away, rest)
+    points = np.einsum("tij,tkj->tki", rot.as_matrix(), local) + pos[:, None]
+    return Track(points, pos, rot)
+
+
+def smooth(times: np.ndarray, start: float, end: float) -> np.ndarray:
+    """Minimum-jerk step from 0 to 1: s = 10 u^3 - 15 u^4 + 6 u^5."""
+    u = np.clip((times - start) / (end - start), 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def _object_path(
+    plan: CarryPlan, times: np.ndarray, ends: np.ndarray, rest: float
+) -> tuple[np.ndarray, Rotation]:
+    start, span = ends[1], ends[2] - ends[1]
+    along = smooth(times, start + 0.15 * span, start + 0.85 * span)
+    up = smooth(times, start, start + 0.45 * span)
+    up = up - smooth(times, start + 0.55 * span, ends[2])
+    pos = np.zeros((len(times), 3))
+    pos[:, :2] = plan.start + along[:, None] * plan.move
+    pos[:, 2] = rest + plan.lift * up
+    middle = smooth(times, start + 0.15 * span, start + 0.5 * span)
+    middle = middle - smooth(times, start + 0.5 * span, start + 0.85 * span)
+    yaw = Rotation.from_rotvec(np.outer(plan.yaw + along * plan.turn, [0, 0, 1]))
+    # inclination about the grasp axis: the object stays between thumb and fingers
+    return pos, yaw * Rotation.from_rotvec(np.outer(middle * plan.tilt, [1, 0, 0]))
+
+
+def _hand_path(
+    grasp: Grasp, shape: Shape, opening: np.ndarray, away: np.ndarray, rest: float
+) -> np.ndarray:
+    """Keypoints in the object frame, (T, 21, 3)."""
+    share = _largest_opening(grasp, rest)
+    steps = np.linspace(0, 1, 33)
+    shapes = np.stack(
+        [
+            grasp.keypoints(grasp.angles + s * share * (OPEN - grasp.angles))
+            for s in steps
+        ]
+    )
+    place = np.clip(opening, 0, 1) * (len(steps) - 1)
+    low = np.minimum(place.astype(int), len(steps) - 2)
+    part = (place - low)[:, None, None]
+    points = (1 - part) * shapes[low] + part * shapes[low + 1]
+    back = np.array([0.0, 0.0, 1.0])
+    if shape.approach == "side":
+        back = np.array([0.0, -0.95, 0.31])
+    return points + STANDOFF * away[:, None, None] * back
+
+
+def _largest_opening(grasp: Grasp, rest: float) -> float:
+    """Share of the open posture that keeps all fingers off the table."""
+    for share in np.linspace(OPENING, 0.1, 9):
+        points = grasp.keypoints(grasp.angles + share * (OPEN - grasp.angles))
+        if points[:, 2].min() > -rest + FINGER_RADIUS:
+            return float(share)
+    return 0.1
+
+
+def grasp_target(shape: Shape, rng: np.random.Generator) -> GraspTarget:
+    """Fingertips on opposite sides of the object, palm inclined towards it."""
+    across = shape.across
+    approach = np.array(
+        [0.0, 0.0, -1.0] if shape.approach == "top" else [0.0, 1.0, 0.0]
+    )
+    tilt = PALM_TILT[shape.approach]
+    x = np.cos(tilt) * across + np.sin(tilt) * approach
+    z = np.cos(tilt) * approach - np.sin(tilt) * across
+    y = np.cross(z, x)
+    floor = float(shape.mesh.bounds[0, 2])
+    centre = np.array([0.0, 0.0, floor + shape.height])
+    gap = rng.uniform(*GAP)
+    tips = np.full((5, 3), np.nan)
+    tips[0] = _touch(shape, centre, -across) - gap * across
+    for i in range(shape.fingers):
+        lateral = FINGER_PITCH * (i - (shape.fingers - 1) / 2)
+        tips[i + 1] = _touch(shape, centre + lateral * y, across) + gap * across
+    mesh = shape.mesh
+    surface, faces, *_ = trimesh.sample.sample_surface(mesh, 1500, seed=0)
+    normals = np.asarray(mesh.face_normals)[faces]
+    palm = np.stack([x, y, z], axis=-1)
+    return GraspTarget(tips, palm, np.asarray(surface), normals, floor)
+
+
+def _touch(shape: Shape, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """First surface point met from far out along -direction towards ``point``."""
+    origin = point + 0.5 * direction
+    hits, _, _ = shape.mesh.ray.intersects_location([origin], [-direction])
+    return hits[np.argmin(np.linalg.norm(hits - origin, axis=-1))]

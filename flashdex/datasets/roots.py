@@ -1,0 +1,193 @@
+"""Is this folder the root of a dataset? What a wrong root looks like, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import trimesh
+
+from flashdex.errors import DemoError, MeshError
+from flashdex.objects.meshes import load_mesh
+
+ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".7z")
+POINTER_START = b"version https://git-lfs"
+POINTER_SIZE = 200  # bytes; a pointer holds three short lines
+NUM_SHOWN = 8  # entries of a folder that a message shows
+
+
+def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
+    """Refuse a root that lacks the folders of a dataset.
+
+    Args:
+        root: what the user gave.
+        folders: all of them must be in the root.
+        dataset: for the message.
+
+    Raises:
+        DemoError: what was sought, what was found, and what is probably meant.
+    """
+    missing = [folder for folder in folders if not (root / folder).is_dir()]
+    if missing:
+        raise DemoError(
+            f"{root}: E_ROOT: not the root of {dataset}. Sought the folders "
+            f"{', '.join(folders)}; missing: {', '.join(missing)}; "
+            f"found: {_found(root)}.{_hint(root, folders)}"
+        )
+
+
+def refuse_pointer(file: Path) -> None:
+    """Refuse a Git-LFS pointer, which stands where the file should be.
+
+    Raises:
+        DemoError: the file is a pointer, or no file at all but a folder, a pipe, a
+            device or a broken link.
+        FileNotFoundError: there is nothing.
+    """
+    if not file.is_file() and (file.exists() or file.is_symlink()):
+        raise DemoError(
+            f"{file}: E_FILE: not a file but a folder, a pipe, a device or a broken "
+            f"link. Put the file itself there."
+        )
+    if file.stat().st_size >= POINTER_SIZE:
+        return
+    with file.open("rb") as stream:
+        start = stream.read(len(POINTER_START))
+    if start == POINTER_START:
+        raise DemoError(
+            f"{file}: E_ROOT: a Git-LFS pointer, not the file itself. "
+            f"Download the content: git lfs pull, or the dataset's own tool."
+        )
+
+
+def refuse_clone(files: Sequence[Path]) -> None:
+    """Refuse a clone whose content was not fetched: its first files are pointers.
+
+    Whatever else is wrong with a file costs its own recording only, when it is read.
+
+    Raises:
+        DemoError: one of the files is a pointer.
+    """
+    for file in files:
+        if file.is_file():
+            refuse_pointer(file)
+
+
+def relative(file: Path, root: Path) -> str:
+    """The path inside the root, for provenance; the bare name of a file elsewhere."""
+    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
+
+
+def _found(root: Path) -> str:
+    if not root.exists():
+        return "no such path"
+    if not root.is_dir():
+        return "a file"
+    names = sorted(entry.name for entry in root.iterdir())
+    more = f" and {len(names) - NUM_SHOWN} more" if len(names) > NUM_SHOWN else ""
+    return (", ".join(names[:NUM_SHOWN]) or "an empty folder") + more
+
+
+def _hint(root: Path, folders: Sequence[str]) -> str:
+    if root.suffix in ARCHIVES and root.is_file():
+        return " Unpack the archive and give the folder."
+    if not root.is_dir():
+        return ""
+    above = root.resolve().parents[:3]
+    inside = sorted(entry for entry in root.iterdir() if entry.is_dir())
+    for place, where in [(above, "inside"), (inside, "above")]:
+        for folder in place:
+            if all((folder / name).is_dir() for name in folders):
+                return f" It lies {where} the root: give {folder}."
+    packed = [e.name for e in sorted(root.iterdir()) if e.suffix in ARCHIVES]
+    return f" Unpack {', '.join(packed[:NUM_SHOWN])}." if packed else ""
+
+
+SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+# names that exporters give the one mesh to look at in an object's own folder
+FAVOURITES = ("visual", "mesh")
+
+
+def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
+    """Mesh file of an object, or None.
+
+    In each folder in turn: ``<name>.{obj,ply,stl,glb}``, then ``<name>/visual.obj``,
+    ``<name>/mesh.obj``, ``<name>/<name>.obj`` (or another suffix), then the only mesh
+    in ``<name>/``.
+
+    Args:
+        name: id of the object; a plain name, not a path.
+        folders: where to look, in order.
+
+    Raises:
+        DemoError: the id is a path, or its folder holds several meshes and none of the
+            names above.
+    """
+    if not name or name in (".", "..") or name != Path(name).name or "\\" in name:
+        raise DemoError(f"Object id '{name}' must be a plain name, not a path.")
+    for folder in folders:
+        for suffix in SUFFIXES:
+            if (file := folder / f"{name}{suffix}").is_file():
+                return file
+        if (found := mesh_in(folder / name)) is not None:
+            return found
+    return None
+
+
+def find_mesh(name: str, folders: Iterable[Path], *, where: Path | str) -> Path:
+    """As ``seek_mesh``, but a missing mesh is an error.
+
+    Args:
+        name: id of the object.
+        folders: where to look, in order.
+        where: the recording, for the message.
+
+    Raises:
+        DemoError: names the folders that were searched.
+    """
+    folders = list(folders)
+    found = seek_mesh(name, folders)
+    if found is None:
+        places = ", ".join(map(str, folders))
+        raise DemoError(
+            f"{where}: no mesh of object '{name}'. Sought {name}.obj (.ply, .stl, "
+            f".glb) and {name}/*.obj in: {places}. Give the folder of the meshes with "
+            f"--models."
+        )
+    return found
+
+
+def mesh_in(folder: Path) -> Path | None:
+    """The mesh in an object's own folder, or None if it has none.
+
+    Raises:
+        DemoError: several meshes, none with a name that tells which to take.
+    """
+    if not folder.is_dir():
+        return None
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES)
+    for stem in (*FAVOURITES, folder.name):
+        for file in files:
+            if file.stem == stem:
+                return file
+    if len(files) > 1:
+        names = ", ".join(f.name for f in files[:4])
+        raise DemoError(
+            f"{folder}: {len(files)} meshes ({names}, ...). Expected one, or one "
+            f"called visual.obj."
+        )
+    return files[0] if files else None
+
+
+def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
+    """The mesh file itself, or its mesh made larger by ``scale``.
+
+    Raises:
+        DemoError: the mesh has to be scaled and cannot be read.
+    """
+    if scale == 1.0:
+        return file
+    try:
+        return load_mesh(file).apply_scale(scale)
+    except MeshError as error:
+        raise DemoError(str(error)) from error

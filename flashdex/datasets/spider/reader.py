@@ -1,0 +1,200 @@
+"""Reads SPIDER's human references: ``trajectory_keypoints.npz``.
+
+They lie in ``processed/<dataset>/mano/<embodiment>/<task>/<id>/``: per side s
+``qpos_wrist_{s}`` (T, 7), ``qpos_finger_{s}`` (T, 5, 7), thumb to pinky, and
+``qpos_obj_{s}`` (T, 7); positions in metres and quaternions wxyz, z up. A side that
+takes no part is zero. ``task_info.json``, there or one level up, names the meshes'
+folders and the time step ``ref_dt``; without it the rate is 50 Hz. An object that both
+hands use stands on the right only. Knuckles are not stored (see ``spider_hand``).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.fields import number, numbers
+from flashdex.datasets.pickles import load_npz
+from flashdex.datasets.roots import refuse_clone
+from flashdex.datasets.source import Recording, Source, SourceOptions
+from flashdex.datasets.spider.hand import fill_hand
+from flashdex.datasets.spider.scene import (
+    INFO,
+    hand_object,
+    known_files,
+    pose_track,
+    read_objects,
+    task_info,
+)
+from flashdex.datasets.tracks import FARTHEST, palm_frame
+from flashdex.errors import DemoError
+from flashdex.keys import SIDES, Side
+
+FILE = "trajectory_keypoints.npz"
+FPS = 50.0  # SPIDER's reference rate, 0.02 s a frame
+# tips that never part by more than this are those of an absent hand, m
+ABSENT_SPREAD = 1e-3
+# Tips farther than this from a nominal hand's, rms, m, are not those of a hand at this
+# wrist; 24 recorded hands stay below 0.09.
+MAX_TIP_ERROR = 0.12
+# SPIDER's reader of GigaHands stores MANO's translation as the wrist [read in its
+# source, dbcb27b]. The wrist is MANO's rest joint away, turning with the hand; in the
+# axes of a right palm, m, to about 1 cm (datasets.md 3.1).
+MANO_WRIST = np.array([-0.10, -0.01, -0.01])
+NO_WRIST = {"gigahand": MANO_WRIST, "gigahands": MANO_WRIST}
+# Its first reader of HOT3D stores the pose of MANO's root joint and poses the fingers
+# from it as if it were the wrist; its later sets (hot3d_v2) are sound.
+REFUSED = ("hot3d",)
+# Do as I Do also stores the joints next to the tips, (T, 5, 3)
+JOINT_KEYS = {"qpos_pip_{}": (2, 6, 10, 14, 18), "qpos_dip_{}": (3, 7, 11, 15, 19)}
+
+
+def list_spider(options: SourceOptions) -> list[Recording]:
+    """All references below a folder, or one file, in path order.
+
+    Raises:
+        DemoError: there is none.
+    """
+    path = options.path
+    assert path is not None  # ``Source.needs``
+    files = [path] if path.is_file() else sorted(path.rglob(FILE))
+    if not files:
+        below = sorted(e.name for e in path.iterdir())[:8] if path.is_dir() else []
+        raise DemoError(
+            f"{path}: no {FILE} (E_ROOT). Found: {', '.join(below) or 'nothing'}. Give "
+            f"SPIDER's dataset folder (the one that holds processed/), or unpack it. "
+            f"Robot results (trajectory_mjwp.npz) are not human references."
+        )
+    refuse_clone(files[:1])
+    names = [_name(file) for file in files]
+    recordings = []
+    for name, file in zip(names, files, strict=True):
+        recordings.append(
+            Recording(
+                name=name if names.count(name) == 1 else _full_name(file),
+                read=partial(read_spider, file, options.models),
+                files=(file, *known_files(file, options.models)),
+            )
+        )
+    return recordings
+
+
+def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
+    """One reference as one motion.
+
+    Args:
+        file: ``trajectory_keypoints.npz``.
+        objects: folder of the meshes, if they lie apart.
+
+    Raises:
+        DemoError: no hand, no object with a mesh, or arrays of another shape.
+    """
+    data, (info, info_file) = load_npz(file), task_info(file)
+    dataset = _dataset(file, info)
+    keypoints: dict[Side, np.ndarray] = {}
+    notes: dict[str, Any] = {}
+    for side in SIDES:
+        if (hand := _read_hand(data, side, file, dataset)) is not None:
+            keypoints[side], notes[side] = hand
+    if not keypoints:
+        raise DemoError(
+            f"{file}: no hand. Expected qpos_wrist_right and qpos_finger_right, or "
+            f"left, with tips apart; found: {', '.join(sorted(data))}."
+        )
+    bodies = read_objects(data, file, info, objects)
+    step = number(info.get("ref_dt") or 1 / FPS, what=f"{info_file}: ref_dt")
+    if not step > 0:
+        raise DemoError(f"{info_file}: ref_dt is {step}; it must be positive, seconds.")
+    pip = any(f"qpos_pip_{side}" in data for side in keypoints)
+    return [
+        HumanDemo(
+            name=_name(file),
+            fps=1 / step,
+            keypoints=keypoints,
+            palm={side: palm_frame(k, side) for side, k in keypoints.items()},
+            objects=[body for _, body in bodies],
+            hand_object=hand_object(bodies, list(keypoints)),
+            source="spider",
+            licence=SPIDER.licence,
+            task=str(info.get("task", "")),
+            provenance={
+                "files": [file.name, *([INFO] if info_file else [])],
+                "keypoints": "tips, PIP and DIP only" if pip else "tips only",
+                "made_up": notes,
+                "fps": "ref_dt" if info.get("ref_dt") else "SPIDER's reference rate",
+            },
+        )
+    ]
+
+
+def _read_hand(
+    data: dict[str, Any], side: Side, file: Path, dataset: str
+) -> tuple[np.ndarray, dict[str, Any]] | None:
+    if f"qpos_finger_{side}" not in data or f"qpos_wrist_{side}" not in data:
+        return None
+    wrist = numbers(data[f"qpos_wrist_{side}"], what=f"{file}: qpos_wrist_{side}")
+    finger = numbers(data[f"qpos_finger_{side}"], what=f"{file}: qpos_finger_{side}")
+    if finger.ndim != 3 or finger.shape[1:] != (5, 7) or wrist.shape[1:] != (7,):
+        raise DemoError(
+            f"{file}: qpos_finger_{side} {finger.shape} and qpos_wrist_{side} "
+            f"{wrist.shape}; expected (T, 5, 7) and (T, 7)."
+        )
+    tips = np.where(np.abs(finger[..., :3]) < FARTHEST, finger[..., :3], np.nan)
+    if not np.nan_to_num(np.ptp(tips, axis=1)).max(initial=0.0) > ABSENT_SPREAD:
+        return None
+    offset = NO_WRIST.get(dataset)
+    frame = pose_track(wrist, f"{file}: qpos_wrist_{side}")
+    hand = fill_hand(frame, tips, side, wrist_in_palm=offset)
+    if offset is not None:
+        hand.notes["wrist"] = "MANO translation, moved to the nominal wrist"
+    error = hand.notes.get("best_axes_m", 0.0)
+    if error > MAX_TIP_ERROR:
+        raise DemoError(
+            f"{file}: tips of the {side} hand are {error:.2f} m (rms) from where a "
+            f"hand at qpos_wrist_{side} has them, whichever way its axes lie. Expected "
+            f"the wrist and five tips (thumb to pinky), metres, in one world."
+        )
+    for key, places in JOINT_KEYS.items():
+        joints = data.get(key.format(side))
+        if joints is not None and np.shape(joints) == (len(tips), 5, 3):
+            hand.keypoints[:, places] = joints
+    return hand.keypoints, hand.notes
+
+
+def _dataset(file: Path, info: dict[str, Any]) -> str:
+    """Name of the dataset that SPIDER processed."""
+    parts = file.parent.parts
+    above = parts[parts.index("processed") + 1 :] if "processed" in parts else ()
+    dataset = str(info.get("dataset_name") or (above[0] if above else ""))
+    if dataset in REFUSED:
+        raise DemoError(
+            f"{file}: SPIDER's '{dataset}' holds no wrist: its reader stored the root "
+            f"joint of MANO in its place. Read HOT3D itself, or its set hot3d_v2."
+        )
+    return dataset
+
+
+def _name(file: Path) -> str:
+    """``<dataset>_<embodiment>_<task>_<id>``."""
+    parts = list(file.parent.parts)
+    if "processed" in parts:
+        parts = parts[len(parts) - parts[::-1].index("processed") :]
+        parts = parts[:1] + parts[2:] if len(parts) > 4 else parts  # not the robot
+    else:
+        parts = parts[-2:]
+    return "_".join(parts)
+
+
+def _full_name(file: Path) -> str:
+    return "_".join(file.parent.parts[-5:])
+
+
+SPIDER = Source(
+    list=list_spider,
+    about="SPIDER's processed human references (trajectory_keypoints.npz)",
+    licence="that of the recordings they were made from; SPIDER itself is CC BY-NC 4.0",
+)

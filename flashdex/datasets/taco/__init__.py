@@ -1,0 +1,1 @@
+"""TACO: sequences of two hands, a tool and a target."""

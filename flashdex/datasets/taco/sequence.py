@@ -1,0 +1,254 @@
+"""One sequence of TACO: its files, and what is read from them.
+
+MANO with the flat hand; ``hand_trans`` is the wrist. Meshes are centimetres, poses
+metres. The origin lies somewhere below the table, so no height is claimed.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flashdex.datasets.body_models.mano import load_mano, rotations_from_axis_angle
+from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.fields import poses_from_matrices, to_array
+from flashdex.datasets.pickles import load_pickle
+from flashdex.datasets.roots import refuse_pointer, relative, scaled_mesh
+from flashdex.datasets.tracks import palm_frame
+from flashdex.errors import DemoError
+from flashdex.keys import SIDES, Side
+
+NUM_POSE, NUM_BETAS = 48, 10
+
+
+def read_all_frames(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters of a file that holds all frames, by keys that sort in time.
+
+    Returns:
+        Axis-angle, rad, (T, 48), and wrist position, m, (T, 3).
+
+    Raises:
+        DemoError: the pickle is refused, or a frame lacks something.
+    """
+    frames = load_pickle(file)
+    if not isinstance(frames, dict) or not frames:
+        raise DemoError(
+            f"{file}: E_KEYS: holds a {type(frames).__name__}; expected a dict of "
+            f"frames, each with hand_pose and hand_trans."
+        )
+    keys = sorted(frames, key=_frame_order)
+    return _stack([(f"{file}, frame {key!r}", frames[key]) for key in keys])
+
+
+def read_frame_files(files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
+    """As ``read_all_frames``, from one file a frame, in time order."""
+    return _stack([(str(file), load_pickle(file)) for file in files])
+
+
+def read_shape(file: Path) -> np.ndarray:
+    """Shape of a hand, (10,).
+
+    Raises:
+        DemoError: the pickle is refused, or holds something else.
+    """
+    shape = load_pickle(file)
+    if not isinstance(shape, dict) or "hand_shape" not in shape:
+        raise DemoError(f"{file}: E_KEYS: expected a dict with hand_shape (10,).")
+    return to_array(shape["hand_shape"], NUM_BETAS, what=f"{file}: hand_shape")
+
+
+def _frame_order(key: object) -> tuple[int, str]:
+    """Time order of frame keys, with or without leading zeros."""
+    text = str(key)
+    return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
+
+
+def _stack(frames: list[tuple[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    rows = []
+    for where, frame in frames:
+        if not isinstance(frame, dict) or not {"hand_pose", "hand_trans"} <= set(frame):
+            raise DemoError(
+                f"{where}: E_KEYS: expected a dict with hand_pose (48,) and hand_trans "
+                f"(3,)."
+            )
+        pose = to_array(frame["hand_pose"], NUM_POSE, what=f"{where}: hand_pose")
+        wrist = to_array(frame["hand_trans"], 3, what=f"{where}: hand_trans")
+        rows.append(np.concatenate([pose, wrist]))
+    table = np.stack(rows)
+    return table[:, :NUM_POSE], table[:, NUM_POSE:]
+
+
+FPS = 30.0
+HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
+ROLES = ("tool", "target")
+MESH_SCALE = 0.01  # centimetres to metres
+MAX_TRIM = 2  # frames by which tracks of a sequence may differ in length
+# what np.load raises on bytes that are no array
+BROKEN = (OSError, ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile)
+LICENCE = "TACO, CC BY 4.0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TacoSequence:
+    """Where one sequence lies.
+
+    Attributes:
+        root: of the dataset.
+        folder: ``(verb, tool, target)/<sequence>``, below both folders of poses.
+        name: of the motion.
+        split: train, test_1 to test_4, or nothing.
+        meshes: file of each mesh id that the sequence names.
+        mano: folder of the hand model.
+    """
+
+    root: Path
+    folder: str
+    name: str
+    split: str
+    meshes: dict[str, Path]
+    mano: Path
+
+    @property
+    def words(self) -> list[str]:
+        """Verb, tool, target."""
+        return self.folder.split("/")[0].strip("()").split(", ")
+
+    def hand_files(self, side: Side) -> list[Path]:
+        """One file of all frames, or one a frame in an older layout; in time order."""
+        folder = self.root / HANDS / self.folder
+        whole = folder / f"{side}_hand.pkl"
+        each = sorted((folder / f"{side}_hand").glob("hand_*.pkl"))
+        return [whole] if whole.is_file() else each
+
+    def shape_file(self, side: Side) -> Path:
+        """The hand's shape; it may be missing."""
+        return self.root / HANDS / self.folder / f"{side}_hand_shape.pkl"
+
+    def pose_files(self, role: str) -> list[Path]:
+        """``<role>_<id>.npy``; one is expected."""
+        return sorted((self.root / OBJECTS / self.folder).glob(f"{role}_*.npy"))
+
+    def files(self) -> list[Path]:
+        """Every file of the dataset that the sequence depends on and that exists."""
+        files = [file for side in SIDES for file in self.hand_files(side)]
+        files += [f for side in SIDES if (f := self.shape_file(side)).is_file()]
+        files += [file for role in ROLES for file in self.pose_files(role)]
+        return [*files, *self.meshes.values()]
+
+
+def mesh_id(pose_file: Path) -> str:
+    """The id in ``tool_<id>.npy``."""
+    return pose_file.stem.partition("_")[2]
+
+
+def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
+    """One sequence as one motion.
+
+    Raises:
+        DemoError: a file is missing or wrong, or tracks differ in length.
+    """
+    for file in sequence.files():
+        refuse_pointer(file)
+    notes: list[str] = []
+    hands: dict[Side, np.ndarray] = {
+        side: _read_hand(sequence, side, notes) for side in SIDES
+    }
+    objects = [_read_object(sequence, role, notes) for role in ROLES]
+    frames = _common_length(sequence, hands, objects, notes)
+    keypoints: dict[Side, np.ndarray] = {s: k[:frames] for s, k in hands.items()}
+    demo = HumanDemo(
+        name=sequence.name,
+        fps=FPS,
+        keypoints=keypoints,
+        palm={s: palm_frame(k, s) for s, k in keypoints.items()},
+        objects=[DemoObject(b.name, b.mesh, b.pose[:frames]) for b in objects],
+        source="taco",
+        licence=LICENCE,
+        split=sequence.split,
+        task=", ".join(sequence.words),
+        provenance={
+            "files": [relative(file, sequence.root) for file in sequence.files()],
+            "fps": FPS,
+            "frames": [0, frames],
+            "roles": {r: b.name for r, b in zip(ROLES, objects, strict=True)},
+            "notes": notes,
+        },
+    )
+    return [demo]
+
+
+def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarray:
+    """Keypoints, m, (T, 21, 3)."""
+    files = sequence.hand_files(side)
+    if not files:
+        raise DemoError(
+            f"{sequence.root / HANDS / sequence.folder}: E_FILE: no {side} hand. "
+            f"Expected {side}_hand.pkl, or {side}_hand/hand_*.pkl."
+        )
+    shape_file = sequence.shape_file(side)
+    if not shape_file.is_file():
+        notes.append(f"W_SHAPE: no {shape_file.name}; the mean shape is used")
+    betas = read_shape(shape_file) if shape_file.is_file() else np.zeros(NUM_BETAS)
+    in_folder = files[0].parent.name == f"{side}_hand"
+    pose, wrist = read_frame_files(files) if in_folder else read_all_frames(files[0])
+    return load_mano(sequence.mano, side).keypoints(
+        rotations_from_axis_angle(pose), betas, wrist, convention="wrist"
+    )
+
+
+def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObject:
+    files = sequence.pose_files(role)
+    if len(files) != 1:
+        raise DemoError(
+            f"{sequence.root / OBJECTS / sequence.folder}: E_FILE: {len(files)} files "
+            f"{role}_<id>.npy; expected one."
+        )
+    file, key = files[0], mesh_id(files[0])
+    if key not in sequence.meshes:
+        raise DemoError(
+            f"{file}: E_FILE: no mesh {key}_cm.obj in Object_Models. Download it, or "
+            f"name the folder of the meshes with --models."
+        )
+    pose, found = poses_from_matrices(_load_matrices(file), what=str(file))
+    notes += found
+    category = sequence.words[1 + ROLES.index(role)].replace(" ", "_")
+    mesh = scaled_mesh(sequence.meshes[key], MESH_SCALE)
+    return DemoObject(f"{category}_{key}", mesh, pose)
+
+
+def _load_matrices(file: Path) -> np.ndarray:
+    try:
+        array = np.load(file, allow_pickle=False)
+    except BROKEN as error:
+        raise DemoError(
+            f"{file}: E_KEYS: not a .npy of plain numbers: {error}. Expected (T, 4, 4) "
+            f"floats; pickled arrays are not read."
+        ) from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise DemoError(f"{file}: E_KEYS: expected one array of (T, 4, 4) floats.")
+    return array
+
+
+def _common_length(
+    sequence: TacoSequence,
+    keypoints: dict[Side, np.ndarray],
+    objects: list[DemoObject],
+    notes: list[str],
+) -> int:
+    """Frames that all tracks have; they may differ by two at the end."""
+    lengths = {f"{side} hand": len(track) for side, track in keypoints.items()}
+    lengths |= {r: len(b.pose) for r, b in zip(ROLES, objects, strict=True)}
+    shortest, longest = min(lengths.values()), max(lengths.values())
+    counts = ", ".join(f"{name} {count}" for name, count in lengths.items())
+    if longest - shortest > MAX_TRIM:
+        raise DemoError(
+            f"{sequence.folder}: E_LEN: frames differ: {counts}. At most {MAX_TRIM} "
+            f"may be missing at the end. Download the sequence again."
+        )
+    if longest > shortest:
+        notes.append(f"E_LEN: trimmed to {shortest} frames: {counts}")
+    return shortest

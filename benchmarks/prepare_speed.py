@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from flashdex.motions.prepare import prepare
+from flashdex.motions.pipeline.prepare import prepare
 from flashdex.system.machine import describe_commit, describe_hardware
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from flashdex.errors import FlashdexError
 
 if TYPE_CHECKING:  # the command line starts fast: heavy parts load in their verb
-    from flashdex.motions.prepare import Order
+    from flashdex.motions.pipeline.prepare import Order
 
 Handler = Callable[[argparse.Namespace], int]
 
@@ -87,7 +87,7 @@ def _fetch(args: argparse.Namespace) -> int:
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from flashdex.motions.prepare import run_order
+    from flashdex.motions.pipeline.prepare import run_order
     from flashdex.viz.library_report import summary_lines, write_library_report
 
     order = _order(args)
@@ -104,8 +104,8 @@ def _prepare(args: argparse.Namespace) -> int:
 
 def _order(args: argparse.Namespace) -> Order:
     from flashdex.datasets.source import SourceOptions
-    from flashdex.motions.prepare import Order
-    from flashdex.motions.process import MotionSettings
+    from flashdex.motions.pipeline.motion import MotionSettings
+    from flashdex.motions.pipeline.prepare import Order
 
     options = SourceOptions(
         path=args.input,

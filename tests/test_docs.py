@@ -222,7 +222,7 @@ def needs_of(source):
 
 
 def test_data_page_names_exactly_the_columns_of_a_report(tmp_path):
-    from flashdex.motions.prepare import prepare
+    from flashdex.motions.pipeline.prepare import prepare
 
     out = tmp_path / "library"
     made = {"out": out, "cache_dir": tmp_path / "cache", "progress": False}

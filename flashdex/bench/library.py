@@ -11,7 +11,7 @@ from flashdex.bench.hulls import cut_hull
 from flashdex.errors import FlashdexError, LibraryError
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.prepare import prepare
+from flashdex.motions.pipeline.prepare import prepare
 from flashdex.objects.asset import ObjectAsset, default_cache_dir
 
 # Both collections use both hands; with one object a motion, one of them is parked.

@@ -32,7 +32,7 @@ from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import missing_frames, palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.checks import MAX_SECONDS
+from flashdex.motions.checks.recording import MAX_SECONDS
 
 FPS = 30.0
 SEQUENCES, TEMPLATES = "raw_seqs", "meta/object_vtemplates"

@@ -23,7 +23,7 @@ from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.demo_support import demo_support
+from flashdex.motions.align import demo_support
 
 KEYS = (
     *("fps", "object", "obj_pose"),

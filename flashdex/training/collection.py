@@ -14,8 +14,8 @@ import torch
 from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError, FlashdexError, LibraryError
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.prepare import Order, hash_inputs, run_order
-from flashdex.motions.process import MotionSettings
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
 
 _LOG = logging.getLogger(__name__)

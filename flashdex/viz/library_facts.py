@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.errors import LibraryError
-from flashdex.motions.checks_aligned import IK_P95, REFERENCE_DEPTH, TIP_DEPTH
+from flashdex.motions.checks.aligned import IK_P95, REFERENCE_DEPTH, TIP_DEPTH
 from flashdex.motions.library import MotionLibrary
 
 STATUSES = ("rejected", "flagged", "kept")

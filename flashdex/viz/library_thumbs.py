@@ -22,7 +22,7 @@ from flashdex.geometry.rotation import quat_rotate
 from flashdex.hands.attach import add_hand
 from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
-from flashdex.motions.contacts import contact_runs
+from flashdex.motions.contact.fingertips import contact_runs
 from flashdex.motions.library import MotionLibrary
 from flashdex.viz import film
 from flashdex.viz.camera import fit_view, view_axes

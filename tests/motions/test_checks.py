@@ -7,12 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.motions.align import align
-from flashdex.motions.checks import Finding, make_strict, status_of
-from flashdex.motions.checks_aligned import check_aligned
-from flashdex.motions.checks_objects import check_objects, check_overlap
-from flashdex.motions.contacts import tip_distances
-from flashdex.motions.gravity import check_up
-from flashdex.motions.jumps import outliers
+from flashdex.motions.checks.aligned import check_aligned, check_up
+from flashdex.motions.checks.objects import check_objects, check_overlap
+from flashdex.motions.checks.recording import Finding, make_strict, status_of
+from flashdex.motions.contact.fingertips import tip_distances
+from flashdex.motions.repair.jumps import outliers
 from flashdex.objects.asset import (
     ObjectAsset,
     ObjectSettings,

@@ -12,9 +12,8 @@ from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
-from flashdex.motions.checks import check_demo
-from flashdex.motions.checks_hands import check_company, check_sides
-from flashdex.motions.repair import repair
+from flashdex.motions.checks.recording import check_company, check_demo, check_sides
+from flashdex.motions.repair.repair import repair
 
 
 @pytest.fixture

@@ -20,10 +20,10 @@ from flashdex.datasets.source import Recording, SourceOptions
 from flashdex.datasets.spider.scene import known_files, read_objects
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, LibraryError, MeshError
-from flashdex.motions import motion_cache
-from flashdex.motions.jobs import Job, run_job
 from flashdex.motions.library_writer import LibraryWriter, _unique_names
-from flashdex.motions.process import MotionSettings
+from flashdex.motions.pipeline import cache as motion_cache
+from flashdex.motions.pipeline.jobs import Job, run_job
+from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.objects import meshes
 from flashdex.objects.asset import ObjectSettings, make_object
 from flashdex.objects.meshes import load_mesh

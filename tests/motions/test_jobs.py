@@ -13,12 +13,12 @@ from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
-from flashdex.motions.checks_aligned import _check_left_out
-from flashdex.motions.jobs import Job, run_job
-from flashdex.motions.pool import run_jobs
-from flashdex.motions.prepare import Order, hash_inputs, prepare, run_order
-from flashdex.motions.process import MotionSettings
-from flashdex.motions.repair import repair
+from flashdex.motions.checks.aligned import _check_left_out
+from flashdex.motions.pipeline.jobs import Job, run_job
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.prepare import Order, hash_inputs, prepare, run_order
+from flashdex.motions.pipeline.workers import run_jobs
+from flashdex.motions.repair.repair import repair
 from flashdex.objects.asset import ObjectSettings
 
 SMALL = ObjectSettings(sdf_resolution=24)

@@ -21,14 +21,15 @@ from flashdex.datasets import list_recordings
 from flashdex.datasets.source import SourceOptions
 from flashdex.errors import FlashdexError
 from flashdex.hands.collision_spheres import HandModel
-from flashdex.motions import process
-from flashdex.motions.attempts import Attempt, Choice
-from flashdex.motions.checks import TRAVEL
-from flashdex.motions.jobs import prepare_recording
-from flashdex.motions.jumps import JUMP_SPEED
-from flashdex.motions.penetration import Penetration
-from flashdex.motions.prepare import prepare
-from flashdex.motions.process import MotionSettings, make_targets
+from flashdex.motions.checks.recording import TRAVEL
+from flashdex.motions.pipeline import motion as process
+from flashdex.motions.pipeline.jobs import prepare_recording
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.prepare import prepare
+from flashdex.motions.repair.jumps import JUMP_SPEED
+from flashdex.motions.retarget.penetration import Penetration
+from flashdex.motions.retarget.starts import Attempt, Choice
+from flashdex.motions.retarget.targets import make_targets
 from flashdex.objects.asset import ObjectSettings
 
 # writers of layouts compute with numbers that are none; that is not what is tested

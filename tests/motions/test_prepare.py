@@ -9,10 +9,10 @@ from flashdex.datasets.demo import DemoObject
 from flashdex.datasets.keypoints import read_keypoints
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.errors import DemoError, LibraryError, UnknownSourceError
-from flashdex.motions.checks import check_demo, status_of
+from flashdex.motions.checks.recording import check_demo, status_of
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.prepare import prepare
-from flashdex.motions.process import MotionSettings, prepare_motion
+from flashdex.motions.pipeline.motion import MotionSettings, prepare_motion
+from flashdex.motions.pipeline.prepare import prepare
 from flashdex.objects.asset import ObjectSettings
 
 QUICK = ObjectSettings(sdf_resolution=40)

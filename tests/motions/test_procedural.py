@@ -18,8 +18,8 @@ from flashdex.datasets.procedural.reader import (
 )
 from flashdex.errors import UnknownSourceError
 from flashdex.keys import SIDES
-from flashdex.motions.contacts import tip_distances
-from flashdex.motions.support import lowest_points
+from flashdex.motions.contact.fingertips import tip_distances
+from flashdex.motions.contact.support import lowest_points
 
 SINGLE = [k for k in KINDS if k.startswith("pick") and k.endswith("right")]
 CARRY = slice(60, 110)  # frames in which the hand surely holds the object

@@ -8,8 +8,13 @@ from scipy.spatial.transform import Rotation
 from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.tracks import palm_frame
-from flashdex.motions.checks import check_demo, concerning, make_strict, status_of
-from flashdex.motions.repair import repair
+from flashdex.motions.checks.recording import (
+    check_demo,
+    concerning,
+    make_strict,
+    status_of,
+)
+from flashdex.motions.repair.repair import repair
 
 FPS = 30.0
 ASIDE = np.array([0, 0.3, 0])

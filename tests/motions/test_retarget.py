@@ -11,9 +11,12 @@ from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.align import align
-from flashdex.motions.penetration import make_reference_scene, measure_penetration
-from flashdex.motions.process import make_targets
-from flashdex.motions.retarget import Retargeter
+from flashdex.motions.retarget.penetration import (
+    make_reference_scene,
+    measure_penetration,
+)
+from flashdex.motions.retarget.solver import Retargeter
+from flashdex.motions.retarget.targets import make_targets
 from flashdex.objects.asset import ObjectSettings, make_object, make_slot_grid
 
 

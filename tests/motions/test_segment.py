@@ -3,11 +3,11 @@ import pytest
 import trimesh
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.motions.activity import nearest_tips, touches
-from flashdex.motions.checks import check_demo, concerning, status_of
-from flashdex.motions.contacts import tip_distances
-from flashdex.motions.repair import repair
-from flashdex.motions.segment import segment
+from flashdex.motions.checks.recording import check_demo, concerning, status_of
+from flashdex.motions.contact.activity import nearest_tips, touches
+from flashdex.motions.contact.fingertips import tip_distances
+from flashdex.motions.repair.repair import repair
+from flashdex.motions.repair.segment import segment
 
 FPS = 30
 SIZE = 0.06

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from flashdex.motions.contacts import (
+from flashdex.motions.contact.fingertips import (
     CONTACT_DISTANCE,
     assign_object,
     blend,
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.support import estimate_support, still_runs, support_disks
+from flashdex.motions.contact.support import estimate_support, still_runs, support_disks
 
 FPS = 60.0
 BOX = trimesh.creation.box((0.08, 0.06, 0.04))

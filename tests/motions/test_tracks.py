@@ -12,7 +12,7 @@ from flashdex.datasets.tracks import (
     resample_pose,
     sample_times,
 )
-from flashdex.motions.wrist import unwrap_wrist
+from flashdex.motions.retarget.solver import unwrap_wrist
 
 AXIS = np.array([1.0, 2.0, -2.0]) / 3
 

@@ -27,7 +27,7 @@ from flashdex.datasets.roots import refuse_pointer, relative
 from flashdex.datasets.tracks import palm_frame, transform_pose
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.support import estimate_support
+from flashdex.motions.contact.support import estimate_support
 from flashdex.objects.meshes import hull_vertices, load_mesh
 
 FPS = 120.0

@@ -19,13 +19,13 @@ from flashdex.datasets import list_recordings
 from flashdex.datasets.source import Recording, SourceOptions
 from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
-from flashdex.motions.jobs import Job, Outcome
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.motion_cache import cache_file, content_hash
-from flashdex.motions.pool import run_jobs
-from flashdex.motions.process import MotionSettings
-from flashdex.motions.residuals import RetargetWeights
+from flashdex.motions.pipeline.cache import cache_file, content_hash
+from flashdex.motions.pipeline.jobs import Job, Outcome
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.workers import run_jobs
+from flashdex.motions.retarget.residuals import RetargetWeights
 from flashdex.objects.asset import ObjectSettings
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet

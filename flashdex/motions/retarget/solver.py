@@ -9,6 +9,7 @@ lie slightly inside its surface; all other parts of the hand are kept out of it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,14 +17,44 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flashdex.datasets.tracks import rotation
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.collision_spheres import HandModel
 from flashdex.hands.jacobian import HandJacobian
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import Side
-from flashdex.motions.residuals import Residuals, RetargetWeights, Targets
-from flashdex.motions.wrist import unwrap_wrist
+from flashdex.motions.retarget.residuals import Residuals, RetargetWeights, Targets
+
+
+def unwrap_wrist(quats: np.ndarray) -> np.ndarray:
+    """Hinge angles with R = Rz(a) Rx(b) R-y(c), continuous over time.
+
+    Each orientation has two solutions, (a, b, c) and (a + pi, pi - b, c + pi); the one
+    nearer to the previous frame is taken, up to full turns.
+
+    Args:
+        quats: wanted orientation of the base, wxyz, (T, 4).
+
+    Returns:
+        rad, (T, 3).
+    """
+    with warnings.catch_warnings():
+        # at the singularity scipy warns and picks a valid solution, which is enough
+        warnings.simplefilter("ignore", UserWarning)
+        first = rotation(quats).as_euler("ZXY") * np.array([1.0, 1.0, -1.0])
+    other = np.stack([first[:, 0] + np.pi, np.pi - first[:, 1], first[:, 2] + np.pi], 1)
+    out = first.copy()
+    for t in range(1, len(quats)):
+        options = [_near(o[t], out[t - 1]) for o in (first, other)]
+        out[t] = min(options, key=lambda o, t=t: np.abs(o - out[t - 1]).sum())
+    middle = (out.min(axis=0) + out.max(axis=0)) / 2
+    return out - 2 * np.pi * np.round(middle / (2 * np.pi))
+
+
+def _near(angles: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    return angles - 2 * np.pi * np.round((angles - previous) / (2 * np.pi))
+
 
 MAX_STEP = 0.15  # m or rad a joint and iteration
 

@@ -15,7 +15,8 @@ from concurrent.futures.process import BrokenProcessPool
 import torch
 from tqdm import tqdm
 
-from flashdex.motions.jobs import Job, Outcome, crashed, run_job
+from flashdex.errors import MissingExtraError
+from flashdex.motions.pipeline.jobs import Job, Outcome, crashed, run_job
 
 _LOG = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ def run_jobs(
     order = _new_meshes_first(jobs)
     queue = [jobs[i] for i in order]
     if ray:
-        from flashdex.motions.ray_pool import run_on_ray
+        pass
 
         stream = run_on_ray(queue)
     elif workers > 1:
@@ -150,3 +151,37 @@ def _show(
 
 def _is_due(last: float) -> bool:
     return time.monotonic() - last > LINE_SECONDS
+
+
+def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
+    """Outcomes as they come, with the places of their jobs.
+
+    Joins the cluster that ``RAY_ADDRESS`` names, else starts one on this machine.
+
+    Args:
+        jobs: one a recording.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+    """
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise MissingExtraError("ray", extra="ray") from error
+    started = not ray.is_initialized()
+    if started:
+        ray.init(log_to_driver=False)
+    try:
+        remote = ray.remote(max_retries=1)(run_job)
+        # the other nodes have caches of their own: motions travel with the answer
+        running = {remote.remote(job, carry=True): i for i, job in enumerate(jobs)}
+        while running:
+            (done,), _ = ray.wait(list(running), num_returns=1)
+            place = running.pop(done)
+            try:
+                yield place, ray.get(done)
+            except ray.exceptions.RayError:
+                yield place, crashed(jobs[place])
+    finally:
+        if started:
+            ray.shutdown()

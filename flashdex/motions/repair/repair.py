@@ -23,7 +23,8 @@ from flashdex.datasets.tracks import (
 )
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.checks import (
+from flashdex.motions.align import demo_support
+from flashdex.motions.checks.recording import (
     FILLED,
     JUMP_EVENTS,
     MAX_SECONDS,
@@ -31,8 +32,7 @@ from flashdex.motions.checks import (
     Finding,
     reject,
 )
-from flashdex.motions.demo_support import demo_support
-from flashdex.motions.jumps import outliers
+from flashdex.motions.repair.jumps import outliers
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation
 LEAST_TRACKED = 0.2  # share of frames below which a track is not worth keeping

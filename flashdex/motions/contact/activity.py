@@ -17,7 +17,7 @@ from flashdex.datasets.tracks import (
     runs,
 )
 from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
-from flashdex.motions.support import STILL_SPEED, STILL_TURN
+from flashdex.motions.contact.support import STILL_SPEED, STILL_TURN
 from flashdex.objects.meshes import reduce_mesh
 from flashdex.objects.signed_distance import surface_distance
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flashdex.geometry.sdf import SdfGrid
-from flashdex.motions.penetration import Penetration
-from flashdex.motions.residuals import Targets
-from flashdex.motions.retarget import Retargeter, Start
+from flashdex.motions.retarget.penetration import Penetration
+from flashdex.motions.retarget.residuals import Targets
+from flashdex.motions.retarget.solver import Retargeter, Start
 
 PENETRATION_SHARE = 0.5
 JERK_COST = 0.01  # m a rad

@@ -13,23 +13,22 @@ from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.tracks import missing_frames, runs
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.activity import (
-    TOUCH_SECONDS,
-    Activity,
-    bridge,
-    find_activity,
-)
-from flashdex.motions.checks import (
+from flashdex.motions.align import demo_support
+from flashdex.motions.checks.recording import (
     FILLED,
     MAX_SECONDS,
     MIN_SECONDS,
     Finding,
     reject,
 )
-from flashdex.motions.demo_support import demo_support
-from flashdex.motions.neighbours import Surfaces
-from flashdex.motions.repair import keep
-from flashdex.motions.roles import Use, find_use
+from flashdex.motions.contact.activity import (
+    TOUCH_SECONDS,
+    Activity,
+    bridge,
+    find_activity,
+)
+from flashdex.motions.contact.roles import Surfaces, Use, find_use
+from flashdex.motions.repair.repair import keep
 from flashdex.objects.meshes import clean_mesh
 
 MARGIN_SECONDS = 0.33

@@ -16,11 +16,16 @@ from typing import Any
 from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.source import Recording
 from flashdex.errors import DemoError, LibraryError, MeshError
-from flashdex.motions.checks import MAX_SECONDS, Finding, concerning
-from flashdex.motions.motion_cache import cache_file, read_prepared, write_prepared
-from flashdex.motions.process import MotionSettings, Prepared, prepare_motion, reject
-from flashdex.motions.repair import repair
-from flashdex.motions.segment import segment
+from flashdex.motions.checks.recording import MAX_SECONDS, Finding, concerning
+from flashdex.motions.pipeline.cache import cache_file, read_prepared, write_prepared
+from flashdex.motions.pipeline.motion import (
+    MotionSettings,
+    Prepared,
+    prepare_motion,
+    reject,
+)
+from flashdex.motions.repair.repair import repair
+from flashdex.motions.repair.segment import segment
 
 logger = logging.getLogger(__name__)
 

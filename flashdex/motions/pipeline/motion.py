@@ -14,22 +14,31 @@ import torch
 from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.tracks import angular_velocity, linear_velocity
 from flashdex.errors import DemoError, MeshError
-from flashdex.geometry.rotation import quat_mul, quat_rotate
 from flashdex.hands.collision_spheres import HandModel
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.keys import SIDES, Side
 from flashdex.motions.align import AlignedDemo, align
-from flashdex.motions.attempts import Choice, choose_attempt
-from flashdex.motions.checks import Finding, check_demo, make_strict, status_of
-from flashdex.motions.checks_aligned import check_aligned, check_retarget
-from flashdex.motions.checks_hands import check_company, check_sides
-from flashdex.motions.contacts import NO_OBJECT, blend
+from flashdex.motions.checks.aligned import check_aligned, check_retarget
+from flashdex.motions.checks.recording import (
+    Finding,
+    check_company,
+    check_demo,
+    check_sides,
+    make_strict,
+    status_of,
+)
+from flashdex.motions.contact.fingertips import NO_OBJECT
+from flashdex.motions.contact.support import support_disks
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.penetration import make_reference_scene, measure_penetration
-from flashdex.motions.residuals import RetargetWeights, Targets
-from flashdex.motions.retarget import Retargeter
-from flashdex.motions.support import support_disks
+from flashdex.motions.retarget.penetration import (
+    make_reference_scene,
+    measure_penetration,
+)
+from flashdex.motions.retarget.residuals import RetargetWeights, Targets
+from flashdex.motions.retarget.solver import Retargeter
+from flashdex.motions.retarget.starts import Choice, choose_attempt
+from flashdex.motions.retarget.targets import _park, make_targets
 from flashdex.objects.asset import (
     ObjectAsset,
     ObjectSettings,
@@ -38,10 +47,6 @@ from flashdex.objects.asset import (
     make_slot_grid,
 )
 from flashdex.objects.meshes import hull_vertices
-
-# where the joints of a hand that takes no part rest, m: out of everyone's way
-PARKED = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
-MIDDLE_KNUCKLE = 9
 
 
 @dataclass(frozen=True)
@@ -234,39 +239,6 @@ def _both(values: np.ndarray, active: np.ndarray) -> np.ndarray:
     out = np.zeros((len(values), 2, *values.shape[2:]), dtype=np.float32)
     out[:, active] = values
     return out
-
-
-def make_targets(aligned: AlignedDemo, hand: HandModel) -> Targets:
-    """What the robot hands should reach in every frame.
-
-    The base is placed so that the robot's middle knuckle meets the human one: the
-    robot's palm is longer than a human's.
-    """
-    palm = torch.tensor(aligned.palm)
-    wrist_quat = quat_mul(palm[..., 3:], hand.wrist_from_palm.expand_as(palm[..., 3:]))
-    keypoints = torch.tensor(aligned.keypoints)
-    arm = quat_rotate(wrist_quat, hand.knuckle.expand(*palm.shape[:-1], 3))
-    poses = torch.tensor(np.stack(aligned.poses, axis=1))
-    normal = torch.tensor([0.0, 0.0, 1.0], dtype=palm.dtype)
-    weight = np.stack([blend(aligned.contact[:, h]) for h in range(2)], axis=1)
-    return Targets(
-        tips=keypoints[..., [4, 8, 12, 16, 20], :],
-        wrist_pos=keypoints[..., MIDDLE_KNUCKLE, :] - arm,
-        wrist_quat=wrist_quat,
-        contact=torch.tensor(weight),
-        hand_object=torch.tensor(aligned.hand_object),
-        object_pos=poses[..., :3],
-        object_quat=poses[..., 3:],
-        palm_normal=quat_rotate(palm[..., 3:], normal.expand(*palm.shape[:-1], 3)),
-    )
-
-
-def _park(joint_pos: np.ndarray, *, acting: np.ndarray) -> np.ndarray:
-    """Both hands (T, 2, J) from the acting ones (T, H, J); the other one rests."""
-    both = np.zeros((len(joint_pos), 2, joint_pos.shape[-1]))
-    both[..., :3] = PARKED
-    both[:, acting] = joint_pos
-    return both
 
 
 def make_frames(

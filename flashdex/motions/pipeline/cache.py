@@ -20,7 +20,7 @@ import numpy as np
 import flashdex
 from flashdex.datasets.source import Recording
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.process import MotionSettings, Prepared
+from flashdex.motions.pipeline.motion import MotionSettings, Prepared
 from flashdex.objects.asset import DAMAGED, read_object
 from flashdex.system.files import hash_file, open_atomic
 

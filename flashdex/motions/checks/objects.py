@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from flashdex.datasets.tracks import rotation
 from flashdex.geometry.sdf import SdfGrid
-from flashdex.motions.checks import Finding, reject
+from flashdex.motions.checks.recording import Finding, reject
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.symmetry import revolution_axis
 

@@ -1,0 +1,1 @@
+"""What a recording or a prepared motion must hold, and what is found."""

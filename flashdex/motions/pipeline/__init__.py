@@ -1,0 +1,1 @@
+"""From recordings to a motion library: jobs, workers, cache."""

@@ -1,0 +1,1 @@
+"""Gaps closed, outliers mended, sessions cut into motions."""

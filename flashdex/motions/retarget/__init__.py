@@ -1,0 +1,1 @@
+"""From human keypoints to joints of the robot hand, with contact."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from flashdex.metrics.signals import Signals
-from flashdex.metrics.verdict import State, Verdict
+from flashdex.metrics.criteria_table import State, Verdict
+from flashdex.metrics.errors import Signals
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
 from flashdex.metrics.perturbation import Perturbation, perturb
 from flashdex.metrics.resimulation import (
     Replay,
@@ -32,7 +33,6 @@ from flashdex.metrics.safety import (
     joint_limit_violations,
     state_deviation,
 )
-from flashdex.metrics.verdict import CertificateVerdict, Verdict
 from flashdex.system.files import write_atomic
 
 CERTIFICATE_SCHEMA = 1

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from flashdex.geometry.rotation import transform_points
-from flashdex.metrics.signals import position_error
+from flashdex.metrics.errors import position_error
 
 AUC_THRESHOLDS = tuple(k / 100 for k in range(1, 10))  # m
 PROBE = 0.05  # m, arm of the six body-fixed points of MPPE

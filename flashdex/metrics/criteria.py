@@ -13,19 +13,16 @@ from torch import Tensor
 
 from flashdex.keys import SIDES, Side
 from flashdex.metrics.criteria_table import (
+    Blame,
     Criterion,
     Limits,
     Term,
+    Verdict,
     criterion_names,
     make_criteria,
     resolve_criterion,
 )
-from flashdex.metrics.signals import (
-    Signals,
-    centred_position_error,
-    reference_drift,
-)
-from flashdex.metrics.verdict import Blame, Verdict
+from flashdex.metrics.errors import Signals, centred_position_error, reference_drift
 
 __all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "score"]
 

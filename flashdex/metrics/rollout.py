@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import RunError
+from flashdex.metrics.errors import Signals, compute_signals
 from flashdex.metrics.rollout_schema import (
     ROLLOUT_SCHEMA,
     SHAPES,
@@ -22,7 +23,6 @@ from flashdex.metrics.rollout_schema import (
     check_schema,
     check_shape,
 )
-from flashdex.metrics.signals import Signals, compute_signals
 from flashdex.system.files import open_atomic
 
 

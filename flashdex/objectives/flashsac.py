@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
-from flashdex.modules.squash import target_entropy
+from flashdex.modules.policy import target_entropy
 from flashdex.objectives.batch import (
     FlashBatch,
     nested,

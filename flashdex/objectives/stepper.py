@@ -8,8 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from flashdex.modules.generator import restore_generator
-from flashdex.modules.layers import project_
+from flashdex.modules.layers import project_, restore_generator
 from flashdex.modules.product import bfloat16_products
 from flashdex.objectives.batch import FlashBatch, nested
 from flashdex.objectives.flashsac import FlashSACLoss

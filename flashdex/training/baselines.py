@@ -13,7 +13,7 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.criteria import criterion_names, score
-from flashdex.metrics.trivial import frozen_object
+from flashdex.metrics.errors import frozen_object
 from flashdex.system.files import write_atomic
 from flashdex.training.attempts import grace_steps
 from flashdex.training.rollouts import roll_all

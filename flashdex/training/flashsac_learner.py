@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.compiled import Assembly
-from flashdex.modules.generator import restore_generator
+from flashdex.modules.layers import restore_generator
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
 from flashdex.training.guard import finite_rows

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from flashdex.modules.generator import restore_generator
+from flashdex.modules.layers import restore_generator
 from flashdex.recipe import dump_recipe
 
 if TYPE_CHECKING:

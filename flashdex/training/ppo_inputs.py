@@ -11,7 +11,7 @@ from torchrl.envs.transforms import Transform
 
 from flashdex import keys
 from flashdex.envs.transforms.compiled import Assembly
-from flashdex.modules.running_norm import RunningNorm
+from flashdex.modules.gaussian_policy import RunningNorm
 from flashdex.training.hand_groups import HandGroups
 
 CHUNK = 4096  # rows assembled at once

@@ -14,7 +14,7 @@ from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
 from flashdex.errors import RunError
 from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
-from flashdex.modules.generator import restore_generator
+from flashdex.modules.layers import restore_generator
 from flashdex.objectives.ppo import PPO, bootstrap_rows
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.recipe import AlgoConfig

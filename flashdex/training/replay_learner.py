@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from flashdex.modules.generator import restore_generator
+from flashdex.modules.layers import restore_generator
 from flashdex.recipe import AlgoConfig
 from flashdex.training.agent import FlashSACAgent
 from flashdex.training.checkpoint import snapshot

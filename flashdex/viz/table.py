@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flashdex.metrics.verdict import Verdict
+from flashdex.metrics.criteria_table import Verdict
 from flashdex.viz.facts import (
     SHOWN,
     MotionFacts,

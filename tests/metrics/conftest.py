@@ -4,7 +4,7 @@ import pytest
 import torch
 from pushed_box import SCENE, make_rollout, step_by_hand
 
-from flashdex.metrics.signals import compute_signals
+from flashdex.metrics.errors import compute_signals
 
 
 def turn_z(angle):

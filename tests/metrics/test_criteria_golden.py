@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from flashdex.metrics.criteria import Limits, criterion_names, score
-from flashdex.metrics.trivial import frozen_object
+from flashdex.metrics.errors import frozen_object
 
 T = 200
 

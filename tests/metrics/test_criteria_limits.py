@@ -7,7 +7,7 @@ import torch
 
 from flashdex.errors import UnknownNameError
 from flashdex.metrics.criteria import resolve_criterion, score
-from flashdex.metrics.signals import Signals
+from flashdex.metrics.errors import Signals
 
 T, GRACE = 47, 15
 DEG = math.pi / 180

@@ -8,7 +8,7 @@ import torch
 
 from flashdex.geometry.rotation import quat_from_axis_angle
 from flashdex.metrics.criteria import score
-from flashdex.metrics.signals import (
+from flashdex.metrics.errors import (
     align_to_reference,
     centred_position_error,
     compute_signals,

@@ -11,7 +11,7 @@ from torch.distributions.transforms import TanhTransform
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.future import FutureEncoder
-from flashdex.modules.squash import sample_squashed, target_entropy
+from flashdex.modules.policy import sample_squashed, target_entropy
 
 
 def _count(module):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from flashdex.modules.running_norm import RunningNorm
+from flashdex.modules.gaussian_policy import RunningNorm
 
 
 def test_merged_moments_are_those_of_all_rows():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from flashdex.objectives.categorical import categorical_projection
+from flashdex.objectives.terms import categorical_projection
 
 
 def _project(prob, reward, entropy_cost, terminated, discount=0.99):

@@ -5,8 +5,7 @@ import copy
 import pytest
 import torch
 
-from flashdex.modules.policy import FlashPolicy
-from flashdex.modules.squash import sample_squashed
+from flashdex.modules.policy import FlashPolicy, sample_squashed
 from flashdex.objectives.stepper import FlashSACStepper
 from flashdex.objectives.terms import backup
 

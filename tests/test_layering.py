@@ -120,7 +120,7 @@ def test_optional_packages_are_imported_lazily_in_their_file(path):
             assert ids(path) in OPTIONAL[package], f"{package} does not belong here"
             if ids(path) not in {WARP_KERNELS, *BRAX_INSIDE}:
                 assert not is_top, f"{package} must be imported inside a function"
-        if name == "flashdex.envs.physics.warp_kernels":
+        if name == "flashdex.envs.physics.warp.kernels":
             assert ids(path) in WARP
             assert not is_top, "kernels must be imported inside a function"
         if name.startswith("flashdex.envs.physics.brax_"):

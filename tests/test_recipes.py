@@ -10,6 +10,7 @@ from typing import get_args, get_type_hints
 import pytest
 import yaml
 
+from flashdex.envs.mdp.options import REGISTRY
 from flashdex.errors import FlashdexError, RecipeError, UnknownRecipeError
 from flashdex.hands.gains import GainsPreset
 from flashdex.metrics.criteria_table import criterion_names
@@ -27,7 +28,6 @@ from flashdex.recipe import (
     override_recipe,
     validate,
 )
-from flashdex.recipe.options import REGISTRY
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 NAMES = sorted(path.stem for path in RECIPES.glob("*.yaml"))

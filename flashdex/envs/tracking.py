@@ -2,30 +2,101 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Size, Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from flashdex import keys
-from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
-from flashdex.envs.assist import AssistSchedule
-from flashdex.envs.contact import CODE_WIDTH, contact_code
-from flashdex.envs.judge import Judge, Outcome, StepInfo
+from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
+from flashdex.envs.mdp.assist import AssistSchedule
+from flashdex.envs.mdp.managers import Judge, Outcome, Scoring, StepInfo
+from flashdex.envs.mdp.resets import ResetDraw, draw_reset, reset_state
+from flashdex.envs.mdp.samplers import SAMPLERS, UnconvertedSampler
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.reset import ResetDraw, draw_reset, reset_state
-from flashdex.envs.samplers import SAMPLERS, UnconvertedSampler
-from flashdex.envs.scoring import Scoring
-from flashdex.envs.specs import action_spec, done_spec, reward_spec, state_spec
-from flashdex.envs.threads import few_threads
-from flashdex.envs.wrench import ObjectWrench, hold_share
+from flashdex.envs.scene.wrench import ObjectWrench, hold_share
+from flashdex.envs.transforms.contact_code import CODE_WIDTH, contact_code
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.recipe import AssistConfig, EnvConfig
+
+# Below this many worlds a thread, waking the threads costs more than they save; beside
+# the physics engine's own threads a barrier can even wait for the scheduler.
+WORLDS_A_THREAD = 1024
+
+
+@contextmanager
+def few_threads(num_envs: int) -> Iterator[None]:
+    """Run the block with at most one torch thread for every 1,024 worlds.
+
+    Args:
+        num_envs: worlds of the tensors inside.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, min(before, num_envs // WORLDS_A_THREAD)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
+    """Compact state of N worlds, as ``flashdex.keys`` lists it.
+
+    Args:
+        num_envs: worlds N.
+        joints: joints of a hand, wrist included.
+        slots: object slots of a world.
+        links: links of a hand.
+    """
+    n = num_envs
+    whole = torch.int64
+    leaves = {
+        keys.JOINT_POS: Unbounded(Size((n, 2, joints))),
+        keys.JOINT_VEL: Unbounded(Size((n, 2, joints))),
+        keys.JOINT_TARGET: Unbounded(Size((n, 2, joints))),
+        keys.OBJECT_POSE: Unbounded(Size((n, slots, 7))),
+        keys.OBJECT_VEL: Unbounded(Size((n, slots, 6))),
+        keys.CONTACT: Unbounded(Size((n, 2, links, CODE_WIDTH)), dtype=torch.int8),
+        keys.MOTION: Unbounded(Size((n, 1)), dtype=whole),
+        keys.FRAME: Unbounded(Size((n, 1)), dtype=whole),
+        keys.ATTEMPT: Binary(1, Size((n, 1)), dtype=torch.bool),
+    }
+    return Composite(leaves, shape=(n,))
+
+
+def action_spec(num_envs: int, joints: int) -> Composite:
+    """Actions of both hands in [-1, 1], (N, J) each."""
+    n = num_envs
+    sides = {
+        s: Composite({keys.ACTION: Bounded(-1.0, 1.0, Size((n, joints)))}, shape=(n,))
+        for s in keys.SIDES
+    }
+    return Composite(sides, shape=(n,))
+
+
+def reward_spec(num_envs: int) -> Composite:
+    """Rewards of both hands, (N, 1) each."""
+    n = num_envs
+    sides = {
+        s: Composite({keys.REWARD: Unbounded(Size((n, 1)))}, shape=(n,))
+        for s in keys.SIDES
+    }
+    return Composite(sides, shape=(n,))
+
+
+def done_spec(num_envs: int) -> Composite:
+    """Flags at the root, (N, 1) each."""
+    n = num_envs
+    names = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
+    flags = {name: Binary(1, Size((n, 1)), dtype=torch.bool) for name in names}
+    return Composite(flags, shape=(n,))
 
 
 class TrackingEnv(EnvBase):

@@ -1,5 +1,8 @@
 """Recipes: schema (the one place of defaults), compose, validate, dump."""
 
+from flashdex.envs.config import AssistConfig, EnvConfig, GymConfig, ResetNoise
+from flashdex.envs.mdp.options import REWARDS, TERMINATIONS, TRANSFORMS, build_options
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.recipe.algo import (
     CRITERIA,
     AlgoConfig,
@@ -17,21 +20,9 @@ from flashdex.recipe.compose import (
     load_recipe,
     override_recipe,
 )
-from flashdex.recipe.env import (
-    AssistConfig,
-    EnvConfig,
-    MotionsConfig,
-    PhysicsConfig,
-    ResetNoise,
-)
-from flashdex.recipe.gym import GymConfig, GymRecipe
+from flashdex.recipe.gym import GymRecipe
 from flashdex.recipe.kinds import expect_kind, require_motions, task_of_run
-from flashdex.recipe.options import (
-    REWARDS,
-    TERMINATIONS,
-    TRANSFORMS,
-    build_options,
-)
+from flashdex.recipe.motions import MotionsConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import copy_recipe, find_recipe, list_recipes
 

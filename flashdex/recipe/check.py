@@ -12,9 +12,9 @@ import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
+from flashdex.envs.mdp.options import REGISTRY, Kind
 from flashdex.errors import RecipeError, nearest
 from flashdex.recipe.kinds import split_foreign
-from flashdex.recipe.options import REGISTRY, Kind
 from flashdex.recipe.schema import RunRecipe
 from flashdex.system.fields import range_problem
 

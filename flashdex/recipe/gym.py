@@ -6,10 +6,10 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
+from flashdex.envs.config import GymConfig
 from flashdex.recipe.algo import AlgoConfig, LoopConfig
 from flashdex.recipe.relations import expect_conflicts, rate_conflicts, replay_conflicts
 from flashdex.recipe.schema import RunRecipe
-from flashdex.system.fields import number
 
 # Keys of `algo` that speak of hands or of the future window.
 HAND_ONLY = (
@@ -20,30 +20,6 @@ HAND_ONLY = (
     "future_channels",
     "ppo",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class GymConfig:
-    """The environment, and how the policy is evaluated in it."""
-
-    env_id: str = ""
-    """Registered id, `HalfCheetah-v4` for example: flat observations, continuous
-    actions; must be given."""
-    num_envs: int = number(1, low=1)
-    """Worlds that are collected from, stepped one after the other."""
-    max_episode_steps: int | None = number(None, low=1)
-    """Steps until an episode is truncated; null = the environment's own limit."""
-    rescale_actions: bool = True
-    """Map [-1, 1] onto the environment's action bounds; false passes actions on as
-    they are, for environments that scale them themselves."""
-    eval_every_env_steps: int = number(100_000, low=1)
-    """Env steps between evaluations; the last one is at the end."""
-    eval_episodes: int = number(50, low=1)
-    """Episodes of an evaluation, by the deterministic policy, in worlds of their own
-    and from the same starts every time."""
-    schedule_env_steps: int | None = number(None, low=1)
-    """Env steps that the learning rate is laid out for; null = total_env_steps. Set it
-    to run the beginning of a longer run."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 
 import yaml
 
+from flashdex.envs.mdp.options import REGISTRY, default_mapping
 from flashdex.errors import FlashdexError, nearest
 from flashdex.recipe.gym import GymRecipe, find_gym_conflicts
-from flashdex.recipe.options import REGISTRY, default_mapping
 from flashdex.recipe.relations import find_conflicts
 from flashdex.recipe.schema import Recipe, RunRecipe
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from flashdex.envs.scene import build_scenes
+from flashdex.envs.scene.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe

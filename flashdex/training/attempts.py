@@ -13,7 +13,7 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene import Scene
+from flashdex.envs.scene.scene import Scene
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.metrics.rollout import Rollout

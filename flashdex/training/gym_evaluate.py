@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
+from flashdex.envs.gym import GymWorlds
 from flashdex.recipe import GymRecipe
-from flashdex.training.gym import GymWorlds
 from flashdex.training.learner import Learner
 
 _LOG = logging.getLogger(__name__)

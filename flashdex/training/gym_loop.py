@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from flashdex.envs.gym import GymWorlds
 from flashdex.errors import RunError
 from flashdex.recipe import GymRecipe
 from flashdex.training.checkpoint import newest_checkpoint, save_checkpoint
@@ -19,7 +20,6 @@ from flashdex.training.guard import (
     first_non_finite,
     numeric_errors,
 )
-from flashdex.training.gym import GymWorlds
 from flashdex.training.gym_evaluate import StoppedError, evaluate_recipe, observed
 from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_stats import GymStats

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from flashdex.envs.gym import GymWorlds
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import GymRecipe, dump_recipe, expect_kind, load_recipe
 from flashdex.system.allocator import keep_freed_memory
@@ -23,7 +24,6 @@ from flashdex.training.checkpoint import (
     remove_temporaries,
     set_aside_newer,
 )
-from flashdex.training.gym import GymWorlds
 from flashdex.training.gym_evaluate import evaluate_recipe
 from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_loop import GymTrainer

@@ -13,11 +13,11 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
+from flashdex.envs.mdp.assist import AssistEpoch
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe
 from flashdex.training.alongside import Alongside
-from flashdex.training.assist_epoch import AssistEpoch
 from flashdex.training.attempt_ring import AttemptRing, Episode
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (

@@ -11,7 +11,7 @@ from torch import nn
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.specs import state_spec
+from flashdex.envs.tracking import state_spec
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.envs.transforms.compiled import Assembly
 from flashdex.hands.spec import HandSpec

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from flashdex.envs.scene import SceneLayout
+from flashdex.envs.scene.scene import SceneLayout
 from flashdex.keys import SIDES
 from flashdex.motions.library import NUM_OBJECT_SLOTS, MotionLibrary
 from flashdex.objects.asset import ObjectSettings

@@ -12,9 +12,9 @@ import mujoco
 import torch
 from mujoco.batch import Batch
 
-from flashdex.envs.physics.warp_memory import WarpMemory, measure_warp
+from flashdex.envs.physics.warp.memory import WarpMemory, measure_warp
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene import build_scenes
+from flashdex.envs.scene.scene import build_scenes
 from flashdex.hands.spec import load_hand
 from flashdex.recipe import Recipe
 from flashdex.system.machine import Pool

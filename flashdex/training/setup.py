@@ -14,7 +14,7 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene import Scene
+from flashdex.envs.scene.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.errors import FlashdexError, LibraryError

@@ -15,7 +15,7 @@ from torch import Tensor
 from flashdex import keys
 
 if TYPE_CHECKING:
-    from flashdex.envs.judge import Outcome
+    from flashdex.envs.mdp.managers import Outcome
 
 Names = tuple[str, ...]
 

@@ -46,7 +46,7 @@ def test_main_prints_one_json_object(library, capsys):
 
 
 def test_threads_are_limited_and_given_back():
-    from flashdex.envs.threads import few_threads
+    from flashdex.envs.tracking import few_threads
 
     before = torch.get_num_threads()
     for worlds, limit in ((1, 1), (1500, 1), (4096, 4)):

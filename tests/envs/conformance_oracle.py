@@ -12,8 +12,8 @@ from conformance_script import NUM_WORLDS, RIGHT, ROW, STEPS, Script
 
 from flashdex import keys
 from flashdex.envs.physics.base import Physics
-from flashdex.envs.scene import Scene
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.scene import Scene
+from flashdex.envs.scene.wrench import ObjectWrench
 
 DECIMATION = 4
 Step = Callable[[mujoco.MjModel, mujoco.MjData], None]

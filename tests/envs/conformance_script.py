@@ -15,7 +15,7 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from flashdex import keys
-from flashdex.envs.contact import encode_contact
+from flashdex.envs.transforms.contact_code import encode_contact
 
 FINGERS = keys.FINGERS
 
@@ -55,7 +55,7 @@ def make_state(library, bank, hands):
 @pytest.fixture(scope="session")
 def scenes(library, hands):
     """Compiled scenes of the three motions."""
-    from flashdex.envs.scene import build_scenes
+    from flashdex.envs.scene.scene import build_scenes
     from flashdex.recipe import PhysicsConfig
 
     return build_scenes(library, hands, PhysicsConfig())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from flashdex.envs.actions import joint_target, lowpass, lowpass_alpha
+from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
 
 SCALE = torch.tensor([0.1] * 3 + [1.0] * 3)
 

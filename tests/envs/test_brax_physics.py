@@ -9,10 +9,10 @@ import torch
 from reduced import reduced_library
 
 from flashdex import keys
-from flashdex.envs.physics.brax import BraxPhysics, refuse_unlike_objects
+from flashdex.envs.physics.brax.engine import BraxPhysics, refuse_unlike_objects
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError
 from flashdex.recipe import PhysicsConfig
 
@@ -208,8 +208,8 @@ def make_wrench(seed=0, slots=2):
 def test_wrench_maths_equals_torch():
     import jax
 
-    from flashdex.envs.physics.brax_share import to_jax, to_torch
-    from flashdex.envs.physics.brax_wrench import object_wrench, wrench_inputs
+    from flashdex.envs.physics.brax.step import to_jax, to_torch
+    from flashdex.envs.physics.brax.wrench import object_wrench, wrench_inputs
 
     wrench, other = make_wrench(), make_wrench(seed=1)
     wrench.hold[2] = 0.0  # the clamped assist alone
@@ -297,7 +297,7 @@ def test_worlds_that_break_down_stay_marked_until_their_reset(engines, start):
 
 
 def test_shared_memory_is_never_written_behind_the_other_side(engines, start):
-    from flashdex.envs.physics.brax_share import to_jax, to_torch
+    from flashdex.envs.physics.brax.step import to_jax, to_torch
 
     source = torch.arange(6.0)
     lent = to_jax(source)
@@ -339,10 +339,11 @@ def test_worlds_without_places_for_contacts_are_noticed(
     import jax
     from mujoco import mjx
 
-    from flashdex.envs.physics import brax_model, brax_step
-    from flashdex.envs.physics.brax_share import to_jax
+    from flashdex.envs.physics.brax import model as brax_model
+    from flashdex.envs.physics.brax import step as brax_step
+    from flashdex.envs.physics.brax.step import to_jax
     from flashdex.envs.physics.state_map import StateMap
-    from flashdex.envs.scene import build_scenes
+    from flashdex.envs.scene.scene import build_scenes
 
     monkeypatch.setattr(brax_model, "CONTACTS_PER_BODY", 1)
     scenes = build_scenes(reduced, hands, PhysicsConfig())

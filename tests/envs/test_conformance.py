@@ -32,7 +32,7 @@ from reduced import reduced_library
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.physics.make import make_physics as build_engine
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene import Scene, build_scenes
+from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.recipe import PhysicsConfig
 
 ABSOLUTE = ("fall.formula", "spin.momentum", "grip.weight", "cradle.weight")

@@ -7,7 +7,12 @@ import math
 import pytest
 import torch
 
-from flashdex.envs.contact import MAX_FORCE, POINT_RANGE, decode_contact, encode_contact
+from flashdex.envs.transforms.contact_code import (
+    MAX_FORCE,
+    POINT_RANGE,
+    decode_contact,
+    encode_contact,
+)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from flashdex import keys
-from flashdex.envs import features
+from flashdex.envs.transforms import features
 from flashdex.geometry.rotation import quat_mul, quat_rotate, quat_to_matrix
 from flashdex.hands.kinematics import HandKinematics
 

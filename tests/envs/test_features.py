@@ -8,8 +8,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from flashdex import keys
-from flashdex.envs.contact import decode_contact
 from flashdex.envs.transforms.build import make_transforms
+from flashdex.envs.transforms.contact_code import decode_contact
 from flashdex.recipe import EnvConfig
 
 ROWS = 6

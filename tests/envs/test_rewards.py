@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from flashdex.envs import rewards
+from flashdex.envs.mdp import rewards
 
 ONE = torch.tensor([1.0, 0.0, 0.0, 0.0])
 

@@ -89,7 +89,7 @@ def test_contact_bits(scenes):
 
 
 def test_hands_pass_through_supports_when_asked(library, hands):
-    from flashdex.envs.scene import build_scenes
+    from flashdex.envs.scene.scene import build_scenes
     from flashdex.recipe import PhysicsConfig
 
     config = PhysicsConfig(hand_support_contact=False)
@@ -103,7 +103,7 @@ def test_hands_pass_through_supports_when_asked(library, hands):
 def test_layout_of_a_one_handed_collection_has_one_hand(library, hands):
     from dataclasses import replace
 
-    from flashdex.envs.scene import SceneLayout
+    from flashdex.envs.scene.scene import SceneLayout
 
     only = replace(library, motions=library.motions[torch.tensor([0])])
     layout = SceneLayout.of(only)

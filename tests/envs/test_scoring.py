@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from flashdex import keys
-from flashdex.envs.scoring import Scoring
+from flashdex.envs.mdp.managers import Scoring
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from flashdex.envs import terminations
+from flashdex.envs.mdp import terminations
 
 LIMITS = {
     "max_link_speed": 100.0,

@@ -24,7 +24,7 @@ def array_bytes(owner):
 
 @pytest.fixture(scope="module")
 def measured(library, hands):
-    from flashdex.envs.physics.warp_memory import measure_warp
+    from flashdex.envs.physics.warp.memory import measure_warp
     from flashdex.recipe import PhysicsConfig
 
     return lambda **values: measure_warp(
@@ -33,7 +33,7 @@ def measured(library, hands):
 
 
 def test_arrays_are_those_of_the_engine(measured, library, hands):
-    from flashdex.envs.physics.warp import WarpPhysics
+    from flashdex.envs.physics.warp.engine import WarpPhysics
     from flashdex.recipe import PhysicsConfig
 
     found = measured()

@@ -9,7 +9,7 @@ import torch
 from no_sync import forbid_sync
 
 from flashdex import keys
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import ObjectWrench
 
 pytest.importorskip("mujoco_warp")
 
@@ -21,7 +21,7 @@ FRAMES = torch.tensor([5, 10, 15])
 @pytest.fixture(scope="module")
 def make_warp(library, hands):
     """Build the warp engine: worlds, then fields of PhysicsConfig."""
-    from flashdex.envs.physics.warp import WarpPhysics
+    from flashdex.envs.physics.warp.engine import WarpPhysics
     from flashdex.recipe import PhysicsConfig
 
     def make(num_envs, **fields):
@@ -170,7 +170,7 @@ def test_each_motion_moves_as_its_own_model_does(trio, start, targets):
     import mujoco_warp as mjw
     import warp as wp
 
-    from flashdex.envs.physics.warp_model import model_fields
+    from flashdex.envs.physics.warp.model import model_fields
 
     trio.reset(everywhere(trio), **start(MOTIONS, FRAMES))
     # Kernels are compiled for the number of rows: with as many they are the same.

@@ -47,9 +47,9 @@ def uneven(tmp_path_factory, hands):
 @pytest.fixture(scope="module")
 def union(uneven, hands):
     """The union of the uneven collection, with all that warp reads."""
-    from flashdex.envs.physics.warp_model import model_fields
-    from flashdex.envs.scene import build_scenes
-    from flashdex.envs.scene_union import build_union
+    from flashdex.envs.physics.warp.model import model_fields
+    from flashdex.envs.scene.scene import build_scenes
+    from flashdex.envs.scene.union import build_union
 
     scenes = build_scenes(uneven, hands, PhysicsConfig())
     return build_union(uneven, hands, PhysicsConfig(), scenes, model_fields())
@@ -74,7 +74,7 @@ def touching(engine, env):
 @pytest.mark.parametrize("count", [3, 1])
 def test_absent_parts_and_supports_touch_nothing(uneven, hands, count):
     """Also in a single world, of which warp would not ask what is absent."""
-    from flashdex.envs.physics.warp import WarpPhysics
+    from flashdex.envs.physics.warp.engine import WarpPhysics
 
     bank = ReferenceBank(uneven, hands)
     warp = WarpPhysics(uneven, hands, PhysicsConfig(), count)
@@ -99,7 +99,7 @@ def test_absent_parts_and_supports_touch_nothing(uneven, hands, count):
 
 
 def test_an_object_without_a_support_falls_as_on_the_cpu_engine(uneven, hands):
-    from flashdex.envs.physics.warp import WarpPhysics
+    from flashdex.envs.physics.warp.engine import WarpPhysics
 
     bank, everywhere = ReferenceBank(uneven, hands), torch.ones(3, dtype=torch.bool)
     warp = WarpPhysics(uneven, hands, PhysicsConfig(), 3)
@@ -130,7 +130,7 @@ def test_rows_are_those_of_the_compiled_scenes(union, uneven, hands):
 
 
 def test_what_worlds_cannot_have_of_their_own_is_refused(union):
-    from flashdex.envs.physics.warp_model import WorldRows, room_of
+    from flashdex.envs.physics.warp.model import WorldRows, room_of
 
     rows = {**union.rows, "geom_condim": np.stack([union.model.geom_condim] * 3)}
     room = room_of(union.model, PhysicsConfig())
@@ -139,7 +139,7 @@ def test_what_worlds_cannot_have_of_their_own_is_refused(union):
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
-    from flashdex.envs.physics.warp_model import require_warp
+    from flashdex.envs.physics.warp.model import require_warp
 
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(MissingExtraError, match=r"mujoco_warp.*extra 'warp'"):

@@ -8,7 +8,7 @@ import time
 import pytest
 import torch
 
-from flashdex.envs.threads import few_threads
+from flashdex.envs.tracking import few_threads
 from flashdex.training.alongside import Alongside
 from flashdex.training.checkpoint import load_checkpoint
 

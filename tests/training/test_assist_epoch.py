@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from flashdex.envs.judge import Outcome
-from flashdex.training.assist_epoch import AssistEpoch
+from flashdex.envs.mdp.assist import AssistEpoch
+from flashdex.envs.mdp.managers import Outcome
 
 
 def judged(active, object_points, cloning):

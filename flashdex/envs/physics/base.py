@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from flashdex.envs.scene import Scene
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.scene import Scene
+from flashdex.envs.scene.wrench import ObjectWrench
 
 
 @dataclass(frozen=True)

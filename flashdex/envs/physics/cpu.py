@@ -14,8 +14,8 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.physics.base import RawState
 from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.scene import Scene, build_scenes
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.scene import Scene, build_scenes
+from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 

@@ -27,11 +27,11 @@ def engine_device(physics: PhysicsConfig) -> torch.device:
     """
     match physics.engine:
         case "warp":
-            from flashdex.envs.physics.warp_model import warp_device
+            from flashdex.envs.physics.warp.model import warp_device
 
             return warp_device()
         case "brax":
-            from flashdex.envs.physics.brax import brax_device
+            from flashdex.envs.physics.brax.engine import brax_device
 
             return brax_device()
         case _:
@@ -50,7 +50,7 @@ def check_engine(library: MotionLibrary, physics: PhysicsConfig) -> None:
     """
     engine_device(physics)
     if physics.engine == "brax":
-        from flashdex.envs.physics.brax import refuse_unlike_objects
+        from flashdex.envs.physics.brax.engine import refuse_unlike_objects
 
         refuse_unlike_objects(library)
 
@@ -76,10 +76,10 @@ def make_physics(
         case "cpu":
             return CpuPhysics(library, hands, physics, num_envs)
         case "warp":
-            from flashdex.envs.physics.warp import WarpPhysics
+            from flashdex.envs.physics.warp.engine import WarpPhysics
 
             return WarpPhysics(library, hands, physics, num_envs)
         case "brax":
-            from flashdex.envs.physics.brax import BraxPhysics
+            from flashdex.envs.physics.brax.engine import BraxPhysics
 
             return BraxPhysics(library, hands, physics, num_envs)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from flashdex import keys
-from flashdex.envs.scene import Scene, parked_joint_pos
+from flashdex.envs.scene.scene import Scene, parked_joint_pos
 from flashdex.geometry.rotation import quat_rotate, quat_rotate_inverse
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary

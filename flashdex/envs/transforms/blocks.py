@@ -8,8 +8,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs import features
 from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.transforms import features
 from flashdex.envs.transforms.base import StateTransform
 from flashdex.envs.transforms.context import Block
 from flashdex.hands.spec import HandSpec

@@ -8,12 +8,12 @@ from typing import Any
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
+from flashdex.envs.mdp.options import build_options
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms import blocks
 from flashdex.envs.transforms.context import ConcatBlocks, TrackingContext
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.recipe.options import build_options
 
 
 def make_transforms(

@@ -9,9 +9,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from flashdex import keys
-from flashdex.envs.features import gather_own
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.base import StateTransform
+from flashdex.envs.transforms.features import gather_own
 from flashdex.hands.kinematics import HandKinematics
 
 _KIN_FIELDS = (

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from flashdex.envs.contact import decode_contact
+from flashdex.envs.transforms.contact_code import decode_contact
 from flashdex.geometry.rotation import (
     quat_conj,
     quat_mul,

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from flashdex import keys
-from flashdex.envs.scene_parts import (
+from flashdex.envs.scene.parts import (
     add_contact_sensors,
     add_object,
     add_supports,

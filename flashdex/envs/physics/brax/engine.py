@@ -22,14 +22,14 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.physics.base import RawState
 from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.scene import Scene, build_scenes
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.scene import Scene, build_scenes
+from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError, MissingExtraError
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.envs.physics.brax_wrench import WrenchInputs
+    from flashdex.envs.physics.brax.wrench import WrenchInputs
     from flashdex.recipe import PhysicsConfig
 
 
@@ -40,8 +40,8 @@ def brax_device() -> torch.device:
         MissingExtraError: brax is not installed.
     """
     try:
-        import flashdex.envs.physics.brax_step  # noqa: F401, all that brax needs
-        from flashdex.envs.physics.brax_share import set_up
+        import flashdex.envs.physics.brax.step  # noqa: F401, all that brax needs
+        from flashdex.envs.physics.brax.step import set_up
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "brax", extra="brax") from error
     return set_up()
@@ -73,10 +73,10 @@ class BraxPhysics:
     ) -> None:
         refuse_unlike_objects(library)
         brax_device()
-        import flashdex.envs.physics.brax_share as share
-        import flashdex.envs.physics.brax_step as code
-        from flashdex.envs.physics.brax_model import build_model
-        from flashdex.envs.physics.brax_wrench import wrench_inputs
+        import flashdex.envs.physics.brax.step as code
+        import flashdex.envs.physics.brax.step as share
+        from flashdex.envs.physics.brax.model import build_model
+        from flashdex.envs.physics.brax.wrench import wrench_inputs
 
         self._share, self._code, self._wrench_inputs = share, code, wrench_inputs
         self.num_envs = num_envs

@@ -1,4 +1,4 @@
-"""The wrench on objects in JAX: the maths of ``flashdex.envs.wrench`` for one world.
+"""The wrench on objects in JAX: the maths of ``envs.scene.wrench`` for one world.
 
 Only imported where brax is known to be installed.
 """
@@ -14,7 +14,7 @@ from brax import math
 from jax import Array
 from torch import Tensor
 
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import ObjectWrench
 
 GRAVITY = 9.81  # m/s2
 

@@ -23,7 +23,7 @@ from brax.base import System
 from brax.io import mjcf
 from jax import Array
 
-from flashdex.envs.scene import Scene
+from flashdex.envs.scene.scene import Scene
 
 # Contacts kept of each kind (sliding only, with torsion), per hand and object slot. MJX
 # solves for every possible contact, 171 of one hand and one box, of which few exist.

@@ -10,7 +10,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from flashdex.envs.scene_union import SceneUnion
+from flashdex.envs.scene.union import SceneUnion
 from flashdex.errors import FlashdexError, MissingExtraError
 
 if TYPE_CHECKING:

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 
 from flashdex import keys
-from flashdex.envs.scene import Scene, SceneLayout, make_hands_spec
-from flashdex.envs.scene_parts import (
+from flashdex.envs.scene.parts import (
     add_contact_sensors,
     add_object_of_meshes,
     add_part_mesh,
     add_supports,
 )
+from flashdex.envs.scene.scene import Scene, SceneLayout, make_hands_spec
 from flashdex.errors import FlashdexError
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from flashdex.envs.mdp.samplers import start_frames
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.samplers import start_frames
 
 if TYPE_CHECKING:
     from flashdex.recipe import ResetNoise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,23 +13,79 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.physics.base import RawState
 from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.physics.warp_graph import Recorded
-from flashdex.envs.physics.warp_model import (
+from flashdex.envs.physics.warp.model import (
     WorldRows,
     model_fields,
     require_warp,
     room_of,
     warp_device,
 )
-from flashdex.envs.physics.warp_wrench import WrenchInput
-from flashdex.envs.scene import Scene, build_scenes
-from flashdex.envs.scene_union import build_union
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.physics.warp.wrench import WrenchInput
+from flashdex.envs.scene.scene import Scene, build_scenes
+from flashdex.envs.scene.union import build_union
+from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
     from flashdex.recipe import PhysicsConfig
+
+_log = logging.getLogger(__name__)
+
+
+class Recorded:
+    """A function of warp launches on fixed arrays, replayed from its second call on.
+
+    The first call runs as it is, which compiles the kernels; the second records it, as
+    a CUDA graph or as warp's list of launches on the CPU. Where that fails the function
+    goes on as it is, with one warning.
+
+    Args:
+        launch: launches kernels; nothing else.
+        device: of the arrays.
+    """
+
+    def __init__(self, launch: Callable[[], None], device: torch.device) -> None:
+        self._launch = launch
+        self._device = device
+        self._name = str(require_warp()[0].device_from_torch(device))
+        self._calls = 0
+        self._graph: Any = None
+
+    def __call__(self) -> None:
+        """Run it after all work that torch has queued so far, before all later work."""
+        wp = require_warp()[0]
+        if self._calls == 1:
+            self._graph = self._record()
+        self._calls += 1
+        stream = None  # the CPU has none
+        if self._device.type == "cuda":
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self._device))
+        if self._graph is not None:
+            wp.capture_launch(self._graph, stream=stream)
+            return
+        with wp.ScopedDevice(self._name), wp.ScopedStream(stream):
+            self._launch()
+
+    def _record(self) -> Any:
+        wp = require_warp()[0]
+        # Torch's default stream cannot be recorded: this one only serves to record.
+        own = wp.Stream(self._name) if self._device.type == "cuda" else None
+        try:
+            with (
+                wp.ScopedDevice(self._name),
+                wp.ScopedStream(own),
+                wp.ScopedCapture(device=self._name, stream=own) as capture,
+            ):
+                self._launch()
+        except Exception as error:
+            _log.warning(
+                "physics.engine=warp: the step could not be recorded and runs launch "
+                "by launch, which is slower: %s",
+                error,
+            )
+            return None
+        return capture.graph
 
 
 def _kinds(overflow: Any) -> dict[str, int]:
@@ -172,7 +230,7 @@ class WarpPhysics:
 
     def _launch_substep(self) -> None:
         wp, mjw = require_warp()
-        from flashdex.envs.physics.warp_kernels import mark_bad
+        from flashdex.envs.physics.warp.kernels import mark_bad
 
         mjw.step(self.model, self.data)
         arrays = [self.data.qpos, self.data.qvel, self.data.qacc]

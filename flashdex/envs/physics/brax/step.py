@@ -5,12 +5,16 @@ Only imported where brax is known to be installed.
 
 from __future__ import annotations
 
+import os
+import platform
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import torch
 from brax import math
 from brax.base import Motion, Transform
 from brax.mjx import pipeline
@@ -18,9 +22,10 @@ from brax.mjx.base import State
 from jax import Array
 from jax.typing import ArrayLike
 from mujoco import mjx
+from torch import Tensor
 
-from flashdex.envs.physics.brax_model import BraxModel
-from flashdex.envs.physics.brax_wrench import WrenchInputs, object_wrench
+from flashdex.envs.physics.brax.model import BraxModel
+from flashdex.envs.physics.brax.wrench import WrenchInputs, object_wrench
 
 MAX_VALUE = 1e10  # MuJoCo's own bound of a usable number
 
@@ -245,3 +250,52 @@ def is_full(model: BraxModel, state: mjx.Data) -> Array:
         if chosen.sum() == model.places:  # otherwise there is room for all
             full |= touching[chosen].all()
     return full
+
+
+_NARROW = {torch.float64: torch.float32, torch.int64: torch.int32}
+
+
+def set_up() -> torch.device:
+    """Choose the device, share it with torch, keep compiled programs; torch's name.
+
+    JAX would take three quarters of a GPU at its start; it does not here, unless
+    ``XLA_PYTHON_CLIENT_PREALLOCATE`` says so. On a TPU torch stays on the host.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        # Programs are for the processor that compiled them; homes can be shared.
+        folder = home / "flashdex" / "jax" / platform.node()
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    device = _target()
+    jax.config.update("jax_default_device", device)
+    if device.platform == "gpu":
+        return torch.device("cuda", device.local_hardware_id)
+    return torch.device("cpu")
+
+
+def to_jax(x: Tensor) -> Array:
+    """A private copy of a tensor as a JAX array, 32 bit.
+
+    Args:
+        x: any shape; float64 and int64 become float32 and int32.
+    """
+    own = x.detach().to(_NARROW.get(x.dtype, x.dtype), copy=True).contiguous()
+    return jax.device_put(jax.dlpack.from_dlpack(own), _target())
+
+
+def to_torch(x: Array) -> Tensor:
+    """A view of a JAX array: read it, never write it, and clone what leaves.
+
+    Args:
+        x: any shape.
+    """
+    if next(iter(x.devices())).platform not in ("cpu", "gpu"):
+        x = jax.device_put(x, jax.devices("cpu")[0])
+    return torch.from_dlpack(x)
+
+
+def _target() -> Any:
+    first = jax.devices()[0]
+    alone = first.platform == "gpu" and not torch.cuda.is_available()
+    return jax.devices("cpu")[0] if alone else first

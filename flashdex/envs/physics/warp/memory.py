@@ -8,15 +8,15 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
-from flashdex.envs.physics.warp_model import (
+from flashdex.envs.physics.warp.model import (
     Room,
     WorldRows,
     model_fields,
     require_warp,
     room_of,
 )
-from flashdex.envs.scene import build_scenes
-from flashdex.envs.scene_union import build_union
+from flashdex.envs.scene.scene import build_scenes
+from flashdex.envs.scene.union import build_union
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import Side
 from flashdex.motions.library import MotionLibrary

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from flashdex.envs.physics.warp_model import require_warp
-from flashdex.envs.wrench import ObjectWrench
+from flashdex.envs.physics.warp.model import require_warp
+from flashdex.envs.scene.wrench import ObjectWrench
 
 if TYPE_CHECKING:
     import mujoco
@@ -58,7 +58,7 @@ class WrenchInput:
         ]
         self._dim = (num_envs, used)
         self._places = [wp.from_torch(p.int().contiguous()) for p in places]
-        from flashdex.envs.physics.warp_kernels import vec7
+        from flashdex.envs.physics.warp.kernels import vec7
 
         kinds = {"ref_pose": vec7, "ref_vel": wp.spatial_vector, "inertia": wp.mat33}
         inputs = [
@@ -89,7 +89,7 @@ class WrenchInput:
     def launch(self) -> None:
         """Write the wrench at the present object states into ``xfrc_applied``."""
         wp = require_warp()[0]
-        from flashdex.envs.physics.warp_kernels import apply_wrench
+        from flashdex.envs.physics.warp.kernels import apply_wrench
 
         wp.launch(
             apply_wrench,

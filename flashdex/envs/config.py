@@ -1,7 +1,4 @@
-"""Schema of the environment half of a recipe: motions, physics, env, assist.
-
-These dataclasses are the one place of defaults. Metres, radians, seconds, kilograms.
-"""
+"""TODO docstring."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from flashdex.recipe.options import default_mapping
+from flashdex.envs.mdp.options import default_mapping
 from flashdex.system.fields import number
 
 
@@ -23,92 +20,6 @@ def _default_rewards() -> dict[str, dict[str, Any] | None]:
 
 def _default_terminations() -> dict[str, dict[str, Any] | None]:
     return default_mapping("terminations")
-
-
-SourceName = Literal[
-    "procedural",
-    "keypoints",
-    "myodm",
-    "taco",
-    "oakink2",
-    "hot3d",
-    "arctic",
-    "grab",
-    "spider",
-    "fdr",
-]
-"""Readers of recordings; `flashdex.datasets.SOURCES` has the same names."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MotionsConfig:
-    """Which motions are trained on: a prepared library, or a source to prepare."""
-
-    library: str | None = None
-    """Folder of a prepared library; when given, nothing is prepared."""
-    source: SourceName | None = None
-    """Reader of the recordings, which are prepared when no library is given."""
-    input: str | None = None
-    """Folder or file the reader reads; procedural and myodm need none."""
-    mano: str | None = None
-    """Folder with MANO_LEFT and MANO_RIGHT, for sources that need the hand model."""
-    models: str | None = None
-    """Folder of the object models, where it lies apart from the recordings."""
-    speed: float = number(1.0, above=0)
-    """Playback speed of the recordings; 0.5 makes a motion last twice as long."""
-    select: list[str] | None = None
-    """Names or globs of the motions to keep; null keeps all."""
-    count: int | None = number(None, low=1)
-    """How many motions to keep or, for procedural ones, to make; null = all."""
-    seed: int = number(0, low=0)
-    """Seed of procedural motions and of preparation."""
-    control_hz: float = number(60.0, above=0)
-    """Control rate at which a source is prepared, 1/s; a library keeps its own, which
-    must be one over physics.timestep x physics.decimation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhysicsConfig:
-    """The physics engine and its numbers."""
-
-    engine: Literal["cpu", "warp", "brax"] = "cpu"
-    """cpu = MuJoCo C on all cores; warp = all worlds on one NVIDIA GPU; brax = MJX on
-    JAX, for collections whose motions all use the same objects."""
-    decimation: int = number(4, low=1)
-    """Physics substeps a control step; fewer is faster and less stable."""
-    timestep: float = number(1 / 240, above=0)
-    """Physics step, s; timestep x decimation must be one control step."""
-    gains: Literal["vendor", "paper"] = "vendor"
-    """Servo gains; vendor = what the real motors can follow (1.1 and 0.4 N m on
-    XHand), paper = 20/1.5 with 100 N m, slower and far stronger."""
-    gravcomp: float = number(1.0, low=0, high=1)
-    """Share of the hand's weight that is compensated; 0 is the released code."""
-    friction: float = number(1.0, low=0)
-    """Sliding friction of hand geoms."""
-    object_friction: float = number(2.0, low=0)
-    """Sliding friction of object geoms; the larger of a pair counts."""
-    support_friction: float = number(1.0, low=0)
-    """Sliding friction of supports; the larger of a pair counts."""
-    condim: int = number(4, low=3, high=6)
-    """Contact dimensions of objects: 3 = sliding, 4 adds torsion at the fingertip."""
-    impratio: float = number(10.0, above=0)
-    """Friction over normal constraint stiffness; larger slips less."""
-    support_disks: bool = True
-    """Rebuild tables and shelves as discs; off, objects have no support at all."""
-    hand_support_contact: bool = True
-    """Hands touch supports; off, they pass through tables as in a mocap overlay."""
-    iterations: int = number(20, low=1)
-    """Solver iterations; certificates use more."""
-    ls_iterations: int = number(50, low=1)
-    """Line-search iterations."""
-    num_threads: int = number(0, low=0)
-    """Threads of the cpu engine; 0 = all cores."""
-    nconmax: int | None = number(None, low=1, high=10_000)
-    """Contacts a world, warp only; null = four for each geom that moves. All worlds
-    share the room."""
-    njmax: int | None = number(None, low=1, high=20_000)
-    """Constraint rows a world, warp only; null = those of so many contacts and of all
-    joint limits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,3 +149,27 @@ class EnvConfig:
     """Failure terminations by name; null removes one."""
     assist: AssistConfig | None = dataclasses.field(default_factory=AssistConfig)
     """The fading wrench on objects; null is the same as enabled: false."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GymConfig:
+    """The environment, and how the policy is evaluated in it."""
+
+    env_id: str = ""
+    """Registered id, `HalfCheetah-v4` for example: flat observations, continuous
+    actions; must be given."""
+    num_envs: int = number(1, low=1)
+    """Worlds that are collected from, stepped one after the other."""
+    max_episode_steps: int | None = number(None, low=1)
+    """Steps until an episode is truncated; null = the environment's own limit."""
+    rescale_actions: bool = True
+    """Map [-1, 1] onto the environment's action bounds; false passes actions on as
+    they are, for environments that scale them themselves."""
+    eval_every_env_steps: int = number(100_000, low=1)
+    """Env steps between evaluations; the last one is at the end."""
+    eval_episodes: int = number(50, low=1)
+    """Episodes of an evaluation, by the deterministic policy, in worlds of their own
+    and from the same starts every time."""
+    schedule_env_steps: int | None = number(None, low=1)
+    """Env steps that the learning rate is laid out for; null = total_env_steps. Set it
+    to run the beginning of a longer run."""

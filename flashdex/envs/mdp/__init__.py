@@ -1,0 +1,1 @@
+"""Terms of the decision process: rewards, terminations, actions, resets."""

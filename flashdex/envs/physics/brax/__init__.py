@@ -1,0 +1,1 @@
+"""MJX on JAX, through brax."""

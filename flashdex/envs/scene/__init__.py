@@ -1,0 +1,1 @@
+"""MuJoCo scenes of motions, their union, and wrenches on objects."""

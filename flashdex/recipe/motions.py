@@ -1,0 +1,52 @@
+"""Schema of the environment half of a recipe: motions, physics, env, assist.
+
+These dataclasses are the one place of defaults. Metres, radians, seconds, kilograms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from flashdex.system.fields import number
+
+SourceName = Literal[
+    "procedural",
+    "keypoints",
+    "myodm",
+    "taco",
+    "oakink2",
+    "hot3d",
+    "arctic",
+    "grab",
+    "spider",
+    "fdr",
+]
+"""Readers of recordings; `flashdex.datasets.SOURCES` has the same names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionsConfig:
+    """Which motions are trained on: a prepared library, or a source to prepare."""
+
+    library: str | None = None
+    """Folder of a prepared library; when given, nothing is prepared."""
+    source: SourceName | None = None
+    """Reader of the recordings, which are prepared when no library is given."""
+    input: str | None = None
+    """Folder or file the reader reads; procedural and myodm need none."""
+    mano: str | None = None
+    """Folder with MANO_LEFT and MANO_RIGHT, for sources that need the hand model."""
+    models: str | None = None
+    """Folder of the object models, where it lies apart from the recordings."""
+    speed: float = number(1.0, above=0)
+    """Playback speed of the recordings; 0.5 makes a motion last twice as long."""
+    select: list[str] | None = None
+    """Names or globs of the motions to keep; null keeps all."""
+    count: int | None = number(None, low=1)
+    """How many motions to keep or, for procedural ones, to make; null = all."""
+    seed: int = number(0, low=0)
+    """Seed of procedural motions and of preparation."""
+    control_hz: float = number(60.0, above=0)
+    """Control rate at which a source is prepared, 1/s; a library keeps its own, which
+    must be one over physics.timestep x physics.decimation."""

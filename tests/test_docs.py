@@ -56,12 +56,12 @@ def first_cells(page, heading):
 @pytest.fixture(scope="module")
 def run_tiny(library, tmp_path_factory):
     """Train for a few steps into a folder of its own; return the folder."""
+    from flashdex.algorithms.config import AlgoConfig, PPOConfig
     from flashdex.envs.config import AssistConfig, EnvConfig
     from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.recipe import Recipe, validate
-    from flashdex.recipe.algo import AlgoConfig, TrainConfig
+    from flashdex.recipe.algo import TrainConfig
     from flashdex.recipe.motions import MotionsConfig
-    from flashdex.recipe.ppo import PPOConfig
     from flashdex.training.run import train
 
     def run(groups, kind="flashsac"):

@@ -9,9 +9,9 @@ from statistics import median
 import torch
 
 from flashdex import keys
+from flashdex.algorithms.flashsac import FlashSACLearner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.flashsac_learner import FlashSACLearner
 from flashdex.training.setup import open_workbench
 
 ROWS_PER_BATCH = 8  # replay rows collected before measuring, in batches

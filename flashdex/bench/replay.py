@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from flashdex import keys
+from flashdex.algorithms.flashsac import FlashSACLearner
 from flashdex.bench.ceilings import copy_gb_per_s, gather_seconds
 from flashdex.bench.clock import free_memory, memory_gb, now, seconds_each
 from flashdex.bench.env import add_recipe_options, compose_bench
@@ -23,8 +24,7 @@ from flashdex.bench.output import emit
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
-from flashdex.training.flashsac_learner import FlashSACLearner
-from flashdex.training.rows import row_bytes
+from flashdex.replay.codec import row_bytes
 from flashdex.training.setup import learner_device, open_workbench
 
 SOURCE_WORLDS = 64  # of the environment whose rows are copied into the ring

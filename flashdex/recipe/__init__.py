@@ -1,11 +1,11 @@
 """Recipes: schema (the one place of defaults), compose, validate, dump."""
 
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import AssistConfig, EnvConfig, GymConfig, ResetNoise
 from flashdex.envs.mdp.options import REWARDS, TERMINATIONS, TRANSFORMS, build_options
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.recipe.algo import (
     CRITERIA,
-    AlgoConfig,
     Criterion,
     LoggerConfig,
     LoopConfig,

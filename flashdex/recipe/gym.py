@@ -6,8 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
-from flashdex.recipe.algo import AlgoConfig, LoopConfig
+from flashdex.recipe.algo import LoopConfig
 from flashdex.recipe.relations import expect_conflicts, rate_conflicts, replay_conflicts
 from flashdex.recipe.schema import RunRecipe
 

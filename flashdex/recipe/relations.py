@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import flashdex.hands
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.errors import nearest
-from flashdex.recipe.algo import AlgoConfig
 from flashdex.recipe.schema import Expectation, Recipe
 
 

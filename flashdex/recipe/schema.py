@@ -6,9 +6,10 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
-from flashdex.recipe.algo import AlgoConfig, LoggerConfig, TrainConfig
+from flashdex.recipe.algo import LoggerConfig, TrainConfig
 from flashdex.recipe.motions import MotionsConfig
 from flashdex.system.fields import number
 

@@ -12,21 +12,21 @@ from typing import Any
 
 import torch
 
+from flashdex.algorithms.base import Learner
 from flashdex.envs.scene.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
+from flashdex.replay.disk import ReplayLog, replay_of
 from flashdex.system.files import write_atomic
 from flashdex.system.machine import versions
 from flashdex.training.attempts import AttemptMaker
 from flashdex.training.baselines import score_baselines
 from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
 from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder, Judging
-from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
-from flashdex.training.replay_file import ReplayLog, replay_of
 from flashdex.training.sessions import Start, begin_session
 from flashdex.training.setup import Workbench, open_workbench
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from flashdex.errors import RunError
 from flashdex.system.files import open_atomic
 
 if TYPE_CHECKING:
-    from flashdex.training.replay_file import ReplayLog
+    from flashdex.replay.disk import ReplayLog
 
 _LOG = logging.getLogger(__name__)
 FOLDER = "checkpoints"
@@ -175,23 +173,6 @@ def remove_temporaries(run_dir: Path) -> None:
     """Delete the half-written files that a killed run left behind."""
     for path in run_dir.rglob(".*.tmp"):
         path.unlink(missing_ok=True)
-
-
-def snapshot(state: Any) -> Any:
-    """Copy of a nested state on the CPU that shares no memory with the original.
-
-    Args:
-        state: tensors and plain values in dicts, lists and tuples.
-    """
-    if isinstance(state, Tensor):
-        return state.detach().to("cpu", copy=True)
-    if isinstance(state, dict):
-        out = copy.copy(state)  # keeps the version notes of a module's state
-        out.update({key: snapshot(value) for key, value in state.items()})
-        return out
-    if isinstance(state, list | tuple):
-        return type(state)(snapshot(value) for value in state)
-    return state
 
 
 def _newest_first(run_dir: Path) -> list[Path]:

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 if TYPE_CHECKING:
-    from flashdex.training.learner import Learner
+    from flashdex.algorithms.base import Learner
 
 # Raw simulator states, which may hold anything once a world diverges.
 RAW = frozenset({"nstep"})
@@ -23,29 +23,6 @@ RAW = frozenset({"nstep"})
 
 class NonFiniteError(Exception):
     """A gradient, loss or weight is NaN or infinite."""
-
-
-def finite_rows(row: TensorDictBase) -> Tensor:
-    """Rows of n-step windows that may be learnt from, (N,) bool.
-
-    Reward, action and state are finite, and so is the state at the window's end unless
-    the window ends in a true termination: nothing is bootstrapped from that one, and
-    packing replaces what is not finite in it.
-
-    Args:
-        row: state, action, reward, next_state and terminated, batch (N,).
-    """
-    own = {k: row.get(k) for k in ("state", "action", "reward")}
-    after = _all_finite(row.get("next_state")) | row.get("terminated").squeeze(-1)
-    for value in own.values():
-        after = after & _all_finite(value)
-    return after
-
-
-def _all_finite(value: Tensor | TensorDictBase) -> Tensor:
-    leaves = value.values(True, True) if isinstance(value, TensorDictBase) else [value]
-    floats = [leaf.flatten(1) for leaf in leaves if leaf.is_floating_point()]
-    return torch.cat(floats, -1).isfinite().all(-1)
 
 
 def first_non_finite(state: Any, path: str = "") -> str:

@@ -11,9 +11,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
+from flashdex.algorithms.base import Learner
 from flashdex.envs.gym import GymWorlds
 from flashdex.recipe import GymRecipe
-from flashdex.training.learner import Learner
 
 _LOG = logging.getLogger(__name__)
 # Keeps the starts of evaluations apart from those of training. A resumed run begins at

@@ -10,9 +10,11 @@ from typing import Any
 
 from torch import Tensor
 
+from flashdex.algorithms.flashsac import GymLearner
 from flashdex.envs.gym import GymWorlds
 from flashdex.errors import RunError
 from flashdex.recipe import GymRecipe
+from flashdex.replay.disk import ReplayLog
 from flashdex.training.checkpoint import newest_checkpoint, save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -21,10 +23,8 @@ from flashdex.training.guard import (
     numeric_errors,
 )
 from flashdex.training.gym_evaluate import StoppedError, evaluate_recipe, observed
-from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_stats import GymStats
 from flashdex.training.logging import MetricLog
-from flashdex.training.replay_file import ReplayLog
 from flashdex.training.sessions import SIGNAL, Start
 from flashdex.training.signals import StopSignals
 

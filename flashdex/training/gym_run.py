@@ -11,9 +11,11 @@ from typing import Any
 
 import torch
 
+from flashdex.algorithms.flashsac import GymLearner
 from flashdex.envs.gym import GymWorlds
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import GymRecipe, dump_recipe, expect_kind, load_recipe
+from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.files import run_lock, write_atomic
 from flashdex.training.checkpoint import (
@@ -25,10 +27,8 @@ from flashdex.training.checkpoint import (
     set_aside_newer,
 )
 from flashdex.training.gym_evaluate import evaluate_recipe
-from flashdex.training.gym_learner import GymLearner
 from flashdex.training.gym_loop import GymTrainer
 from flashdex.training.logging import MetricLog
-from flashdex.training.replay_file import ReplayLog
 from flashdex.training.run import RECIPE, create_run_dir, default_run_dir
 from flashdex.training.sessions import begin_session, end_session
 

@@ -13,10 +13,12 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
+from flashdex.algorithms.base import Learner
 from flashdex.envs.mdp.assist import AssistEpoch
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe
+from flashdex.replay.disk import ReplayLog
 from flashdex.training.alongside import Alongside
 from flashdex.training.attempt_ring import AttemptRing, Episode
 from flashdex.training.checkpoint import save_checkpoint
@@ -27,14 +29,12 @@ from flashdex.training.guard import (
     numeric_errors,
 )
 from flashdex.training.judging import Judging
-from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop_state import load_loop_state, loop_state
 from flashdex.training.nan_dump import stop_with_dump
 from flashdex.training.progress import Progress
 from flashdex.training.record import make_record
-from flashdex.training.replay_file import ReplayLog
 from flashdex.training.sessions import SIGNAL, Start
 from flashdex.training.signals import StopSignals
 from flashdex.training.stats import RunningStats

@@ -10,6 +10,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from flashdex import keys
+from flashdex.algorithms.agent import make_actor, make_critic, make_encoder
+from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import state_spec
 from flashdex.envs.transforms.build import make_transforms
@@ -19,8 +21,7 @@ from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
 from flashdex.modules.layers import warm_up_statistics
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.recipe import AlgoConfig, EnvConfig
-from flashdex.training.agent import make_actor, make_critic, make_encoder
-from flashdex.training.hand_groups import HandGroups
+from flashdex.replay.codec import RowCodec, row_bytes
 from flashdex.training.memory_walk import (
     PeakMeter,
     flashsac_flops,
@@ -29,7 +30,6 @@ from flashdex.training.memory_walk import (
     tensor_bytes,
     walk_flashsac,
 )
-from flashdex.training.rows import RowCodec, row_bytes
 
 _FEW, _MORE = 32, 64  # rows assembled to see what one more takes
 _ADAM_STEP = 4  # bytes of Adam's own counter, one a parameter tensor

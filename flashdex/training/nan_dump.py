@@ -10,21 +10,16 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from flashdex.algorithms.base import Learner, snapshot
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe, dump_recipe, expect_kind, load_recipe
 from flashdex.system.files import open_atomic
-from flashdex.training.checkpoint import (
-    FORMAT,
-    check_format,
-    newest_checkpoint,
-    snapshot,
-)
+from flashdex.training.checkpoint import FORMAT, check_format, newest_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
     first_non_finite,
     numeric_errors,
 )
-from flashdex.training.learner import Learner
 
 DUMP = "nan_dump.pt"
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 
+from flashdex.algorithms.base import Learner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.training.judging import Judging
-from flashdex.training.learner import Learner
 from flashdex.training.ledger import Ledger
 
 _LOG = logging.getLogger(__name__)

@@ -20,6 +20,7 @@ from flashdex.recipe import (
     expect_kind,
     load_recipe,
 )
+from flashdex.replay.buffer import check_pinning
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.files import run_lock, write_atomic
 from flashdex.system.machine import versions
@@ -34,7 +35,6 @@ from flashdex.training.checkpoint import (
 from flashdex.training.fixed import refuse_changes
 from flashdex.training.memory import check_memory
 from flashdex.training.memory_library import find_library
-from flashdex.training.replay_store import check_pinning
 from flashdex.training.sessions import end_session
 from flashdex.training.setup import Workbench, learner_device, open_workbench
 

@@ -12,6 +12,9 @@ import torch
 from torch import Tensor
 
 from flashdex import keys
+from flashdex.algorithms.base import Learner
+from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.algorithms.ppo import PPOLearner
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
@@ -25,9 +28,6 @@ from flashdex.recipe import Recipe
 from flashdex.system.machine import versions
 from flashdex.training.attempts import AttemptMaker
 from flashdex.training.collection import load_library, select_motions
-from flashdex.training.flashsac_learner import FlashSACLearner
-from flashdex.training.learner import Learner
-from flashdex.training.ppo_learner import PPOLearner
 
 _LOG = logging.getLogger(__name__)
 

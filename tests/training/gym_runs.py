@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 
 from flashdex.recipe import AlgoConfig, GymConfig, GymRecipe, LoopConfig
+from flashdex.replay.disk import ReplayLog
 from flashdex.training.gym_loop import GymTrainer
 from flashdex.training.gym_run import make_gym_learner
 from flashdex.training.logging import MetricLog
-from flashdex.training.replay_file import ReplayLog
 from flashdex.training.sessions import Start
 
 TINY = {

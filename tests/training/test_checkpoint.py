@@ -13,8 +13,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from flashdex.algorithms.base import snapshot
 from flashdex.errors import RunError
-from flashdex.training import replay_file
+from flashdex.replay import disk as replay_file
+from flashdex.replay.disk import ReplayLog
 from flashdex.training.checkpoint import (
     FOLDER,
     checkpoint_names,
@@ -22,9 +24,7 @@ from flashdex.training.checkpoint import (
     remove_temporaries,
     save_checkpoint,
     set_aside_newer,
-    snapshot,
 )
-from flashdex.training.replay_file import ReplayLog
 
 CAPACITY = 20
 

@@ -10,13 +10,9 @@ from tensordict import TensorDict
 
 from flashdex import keys
 from flashdex.errors import RunError
+from flashdex.replay.codec import finite_rows
 from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.guard import (
-    GradientGuard,
-    NonFiniteError,
-    finite_rows,
-    first_non_finite,
-)
+from flashdex.training.guard import GradientGuard, NonFiniteError, first_non_finite
 from flashdex.training.nan_dump import DUMP, reopen
 from flashdex.training.run import resume
 

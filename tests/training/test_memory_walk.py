@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from flashdex.algorithms.agent import make_actor, make_critic
 from flashdex.bench.products import count_products, total_flops
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.recipe import AlgoConfig
-from flashdex.training.agent import make_actor, make_critic
 from flashdex.training.memory_walk import (
     PeakMeter,
     flashsac_flops,

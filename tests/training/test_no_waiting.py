@@ -10,9 +10,9 @@ from no_sync import forbid_sync
 from torch.overrides import TorchFunctionMode
 
 from flashdex import keys
+from flashdex.algorithms.config import PPOConfig
 from flashdex.envs.mdp.assist import AssistEpoch
 from flashdex.envs.mdp.managers import Outcome
-from flashdex.recipe.ppo import PPOConfig
 from flashdex.training.guard import GradientGuard, numeric_errors
 from flashdex.training.stats import RunningStats
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from flashdex.training.nstep import NStepAssembler
+from flashdex.replay.nstep import NStepAssembler
 
 GAMMA, WORLDS, LENGTH = 0.9, 7, 60
 

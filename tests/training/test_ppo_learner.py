@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from flashdex import keys
+from flashdex.algorithms.config import PPOConfig
 from flashdex.envs.transforms.base import assemble
 from flashdex.errors import RunError
 from flashdex.recipe import MotionsConfig, TrainConfig
-from flashdex.recipe.ppo import PPOConfig
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
 
 HORIZON, WORLDS, ATTEMPTS = 8, 6, 2

@@ -11,9 +11,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from flashdex.errors import FlashdexError
 from flashdex.recipe import AlgoConfig
-from flashdex.training.replay_file import ReplayLog
-from flashdex.training.replay_ring import RowStorage
-from flashdex.training.replay_store import HostBuffer, RowBuffer, make_buffer
+from flashdex.replay.buffer import HostBuffer, RowBuffer, RowStorage, make_buffer
+from flashdex.replay.disk import ReplayLog
 
 CPU = torch.device("cpu")
 SIZES = {"batch_size": 64, "device": CPU}

@@ -9,7 +9,7 @@ import torch
 from no_sync import forbid_sync
 from tensordict import TensorDict
 
-from flashdex.training.row_patch import RowPatch
+from flashdex.replay.codec import RowPatch
 
 NAN = float("nan")
 

@@ -10,8 +10,8 @@ from flashdex import keys
 from flashdex.envs.transforms.base import assemble
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.recipe import EnvConfig
-from flashdex.training.nstep import NStepAssembler
-from flashdex.training.rows import RowCodec, row_bytes
+from flashdex.replay.codec import RowCodec, row_bytes
+from flashdex.replay.nstep import NStepAssembler
 
 
 @pytest.fixture(scope="module")

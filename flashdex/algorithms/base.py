@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import copy
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+
+if TYPE_CHECKING:
+    pass
 
 
 class Learner(Protocol):
@@ -80,3 +84,20 @@ class Learner(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict``."""
         ...
+
+
+def snapshot(state: Any) -> Any:
+    """Copy of a nested state on the CPU that shares no memory with the original.
+
+    Args:
+        state: tensors and plain values in dicts, lists and tuples.
+    """
+    if isinstance(state, Tensor):
+        return state.detach().to("cpu", copy=True)
+    if isinstance(state, dict):
+        out = copy.copy(state)  # keeps the version notes of a module's state
+        out.update({key: snapshot(value) for key, value in state.items()})
+        return out
+    if isinstance(state, list | tuple):
+        return type(state)(snapshot(value) for value in state)
+    return state

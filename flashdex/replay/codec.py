@@ -7,12 +7,18 @@ with two objects take under 1 kB a row.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
+
+if TYPE_CHECKING:
+    pass
 
 _MAX_SPEED = 1000.0  # m/s or rad/s; beyond it the episode has ended as insane anyway
 
@@ -122,3 +128,92 @@ class RowCodec:
 def row_bytes(packed: TensorDictBase) -> int:
     """Bytes of one packed row."""
     return sum(v[0].numel() * v.element_size() for v in packed.values(True, True))
+
+
+class RowPatch:
+    """Puts copies of sound rows in the place of bad ones, and counts those.
+
+    As many rows leave as come in, so the host need not know how many are bad: asking
+    the device would stall it at every vector step. A bad row becomes a copy of the
+    nearest sound row before it, else of the first sound one; where a whole step is bad,
+    of a sound row of an earlier step. Before there is any, it is a blank row.
+
+    Args:
+        device: of the rows.
+        ones: leaves that are 1 in a blank row, where all others are 0.
+
+    Example:
+        >>> patch = RowPatch(torch.device("cpu"))
+        >>> rows = TensorDict({"x": torch.tensor([[1.0], [float("nan")], [3.0]])}, [3])
+        >>> patch(rows, torch.tensor([True, False, True]))["x"].flatten().tolist()
+        [1.0, 1.0, 3.0]
+        >>> patch.count
+        1
+    """
+
+    def __init__(self, device: torch.device, *, ones: Collection[str] = ()) -> None:
+        self.ones = ones
+        self._bad = torch.zeros((), dtype=torch.int64, device=device)
+        self._spare: dict[str, Tensor] | None = None  # (1, ...) each
+
+    @property
+    def count(self) -> int:
+        """Bad rows so far; waits for the device."""
+        return int(self._bad)
+
+    @count.setter
+    def count(self, value: int) -> None:
+        self._bad.fill_(value)
+
+    def __call__(self, rows: TensorDict, good: Tensor) -> TensorDict:
+        """Patch the rows of one step.
+
+        Args:
+            rows: flat, batch (N,).
+            good: rows that are sound, (N,) bool.
+
+        Returns:
+            N sound rows, none of them shared with ``rows``.
+        """
+        size = len(good)
+        self._bad += (~good).sum()
+        own = torch.arange(size, device=good.device)
+        before = torch.where(good, own, -1).cummax(0).values
+        # the last row is the spare one, for a step without any sound row
+        first = torch.where(good, own, size).amin()
+        donor = torch.where(before < 0, first, before)
+        leaves: dict[str, Any] = dict(rows.items())
+        spare = self._spare or self._blank(leaves)
+        patched = {
+            key: torch.cat([leaf, spare[key]]).index_select(0, donor)
+            for key, leaf in leaves.items()
+        }
+        self._spare = {key: leaf[-1:].clone() for key, leaf in patched.items()}
+        return TensorDict(patched, batch_size=[size])
+
+    def _blank(self, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        fresh = {True: torch.ones_like, False: torch.zeros_like}
+        return {k: fresh[k in self.ones](leaf[:1]) for k, leaf in leaves.items()}
+
+
+def finite_rows(row: TensorDictBase) -> Tensor:
+    """Rows of n-step windows that may be learnt from, (N,) bool.
+
+    Reward, action and state are finite, and so is the state at the window's end unless
+    the window ends in a true termination: nothing is bootstrapped from that one, and
+    packing replaces what is not finite in it.
+
+    Args:
+        row: state, action, reward, next_state and terminated, batch (N,).
+    """
+    own = {k: row.get(k) for k in ("state", "action", "reward")}
+    after = _all_finite(row.get("next_state")) | row.get("terminated").squeeze(-1)
+    for value in own.values():
+        after = after & _all_finite(value)
+    return after
+
+
+def _all_finite(value: Tensor | TensorDictBase) -> Tensor:
+    leaves = value.values(True, True) if isinstance(value, TensorDictBase) else [value]
+    floats = [leaf.flatten(1) for leaf in leaves if leaf.is_floating_point()]
+    return torch.cat(floats, -1).isfinite().all(-1)

@@ -19,9 +19,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
+from flashdex.replay.buffer import RowBuffer
 from flashdex.system.files import open_atomic, write_atomic
 from flashdex.training.checkpoint import FOLDER
-from flashdex.training.replay_store import RowBuffer
 
 _LOG = logging.getLogger(__name__)
 REPLAY = "replay"

@@ -1,0 +1,1 @@
+"""What acts, remembers and learns: FlashSAC and PPO."""

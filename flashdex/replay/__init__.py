@@ -1,0 +1,1 @@
+"""Replay rows: how they are coded, kept, drawn and stored."""

@@ -60,8 +60,8 @@ def run_tiny(library, tmp_path_factory):
     from flashdex.envs.config import AssistConfig, EnvConfig
     from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.recipe import Recipe, validate
-    from flashdex.recipe.algo import TrainConfig
     from flashdex.recipe.motions import MotionsConfig
+    from flashdex.recipe.run import TrainConfig
     from flashdex.training.run import train
 
     def run(groups, kind="flashsac"):

@@ -4,13 +4,6 @@ from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import AssistConfig, EnvConfig, GymConfig, ResetNoise
 from flashdex.envs.mdp.options import REWARDS, TERMINATIONS, TRANSFORMS, build_options
 from flashdex.envs.physics.config import PhysicsConfig
-from flashdex.recipe.algo import (
-    CRITERIA,
-    Criterion,
-    LoggerConfig,
-    LoopConfig,
-    TrainConfig,
-)
 from flashdex.recipe.check import validate
 from flashdex.recipe.compose import (
     compose,
@@ -20,11 +13,17 @@ from flashdex.recipe.compose import (
     load_recipe,
     override_recipe,
 )
-from flashdex.recipe.gym import GymRecipe
-from flashdex.recipe.kinds import expect_kind, require_motions, task_of_run
 from flashdex.recipe.motions import MotionsConfig
+from flashdex.recipe.run import (
+    CRITERIA,
+    Criterion,
+    LoggerConfig,
+    LoopConfig,
+    TrainConfig,
+)
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import copy_recipe, find_recipe, list_recipes
+from flashdex.recipe.tasks import GymRecipe, expect_kind, require_motions, task_of_run
 
 __all__ = [
     "CRITERIA",

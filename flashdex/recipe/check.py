@@ -14,8 +14,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from flashdex.envs.mdp.options import REGISTRY, Kind
 from flashdex.errors import RecipeError, nearest
-from flashdex.recipe.kinds import split_foreign
 from flashdex.recipe.schema import RunRecipe
+from flashdex.recipe.tasks import split_foreign
 from flashdex.system.fields import range_problem
 
 R = TypeVar("R", bound=RunRecipe)

@@ -8,29 +8,236 @@ mistake.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from flashdex.errors import FlashdexError, RecipeError
+from flashdex.errors import FlashdexError, RecipeError, nearest
 from flashdex.recipe.check import read_recipe
-from flashdex.recipe.defaults import check_defaults, known_groups
-from flashdex.recipe.kinds import kind_of, mark_groups
-from flashdex.recipe.overrides import (
-    apply_values,
-    choose_groups,
-    expand_sweeps,
-    hydra_choices,
-    parse_overrides,
-)
 from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.store import find_recipe, search_dirs
+from flashdex.recipe.tasks import kind_of, mark_groups
+
+Groups = dict[str, list[str]]
+
+
+def known_groups(dirs: Sequence[Path]) -> Groups:
+    """Return group name to its options, over all folders of the search path.
+
+    Args:
+        dirs: folder of the recipe first, then where names are looked up. The first
+            may be any folder of the user's, so it adds options but no groups.
+    """
+    groups: dict[str, set[str]] = {}
+    names = {path.parent.name for d in search_dirs() for path in d.glob("*/*.yaml")}
+    for folder in dirs:
+        for path in folder.glob("*/*.yaml"):
+            if path.parent.name in names:
+                groups.setdefault(path.parent.name, set()).add(path.stem)
+    return {name: sorted(options) for name, options in sorted(groups.items())}
+
+
+def check_option(group: str, option: str, groups: Groups, problems: list[str]) -> bool:
+    """Note a group or an option that does not exist; say whether both do."""
+    if group not in groups:
+        problems.append(
+            f"defaults.{group}: unknown group.{nearest(group, groups)} "
+            f"Allowed: {', '.join(groups)}."
+        )
+    elif option not in groups[group]:
+        problems.append(
+            f"{group}={option}: there is no such {group}."
+            f"{nearest(option, groups[group])} Allowed: {', '.join(groups[group])}."
+        )
+    else:
+        return True
+    return False
+
+
+def check_defaults(
+    path: Path, groups: Groups, problems: list[str]
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Check the defaults list of one file.
+
+    Args:
+        path: the recipe.
+        groups: what exists.
+        problems: where problems are noted.
+
+    Returns:
+        The options of each group it names, and the groups with a wrong option.
+    """
+    named: dict[str, list[str]] = {}
+    broken: list[str] = []
+    has_self = False
+    for entry in _read_defaults(path):
+        has_self = has_self or entry == "_self_"
+        for key, value in entry.items() if isinstance(entry, dict) else ():
+            *words, group = str(key).replace("/", " ").split()
+            _check_entry(group, words, has_self, problems)
+            options = [str(v) for v in (value if isinstance(value, list) else [value])]
+            good = [check_option(group, o, groups, problems) for o in options]
+            named[group] = options
+            if not all(good):
+                broken.append(group)
+    return named, broken
+
+
+def _check_entry(
+    group: str, words: list[str], has_self: bool, problems: list[str]
+) -> None:
+    """Note the two ways in which Hydra would drop a choice without a word."""
+    if "optional" in words:
+        problems.append(
+            f"defaults.{group}: 'optional' hides a misspelt option; leave it out (use "
+            f"'{group}: none' for nothing)"
+        )
+    if group == "ablation" and not has_self:
+        problems.append(
+            "defaults: '_self_' must stand before 'ablation', or the recipe wins and "
+            "the ablation has no effect"
+        )
+
+
+def _read_defaults(path: Path) -> list[Any]:
+    try:
+        data = yaml.safe_load(path.read_text())
+    except yaml.YAMLError:
+        return []  # Hydra reads it next and says where the syntax is wrong
+    entries = data.get("defaults") if isinstance(data, dict) else None
+    return entries if isinstance(entries, list) else []
+
+
+def parse_overrides(texts: Sequence[str]) -> tuple[list[Override], list[str]]:
+    """Parse each override on its own; return the good ones and the problems."""
+    parser = OverridesParser.create()
+    parsed: list[Override] = []
+    problems: list[str] = []
+    for text in texts:
+        try:
+            override = parser.parse_override(text)
+        except HydraException:
+            problems.append(
+                f"override '{text}': not understood; write key=value, ~key or "
+                f"group=option"
+            )
+            continue
+        if override.is_sweep_override():
+            problems.append(f"override '{text}': several values need the flag -m")
+            continue
+        parsed.append(override)
+    return parsed, problems
+
+
+def expand_sweeps(texts: Sequence[str]) -> list[list[str]]:
+    """Return one list of overrides a run: the product of all `key=a,b` (flag -m).
+
+    Example:
+        >>> expand_sweeps(["seed=0,1", "hand=xhand"])
+        [['seed=0', 'hand=xhand'], ['seed=1', 'hand=xhand']]
+    """
+    parser = OverridesParser.create()
+    choices: list[list[str]] = []
+    for text in texts:
+        try:
+            override = parser.parse_override(text)
+        except HydraException as error:
+            raise RecipeError([f"override '{text}': not understood"]) from error
+        if override.is_sweep_override():
+            key = override.get_key_element()
+            choices.append([f"{key}={v}" for v in override.sweep_string_iterator()])
+        else:
+            choices.append([text])
+    return [list(run) for run in itertools.product(*choices)]
+
+
+def choose_groups(
+    parsed: Sequence[Override], groups: Groups, problems: list[str]
+) -> dict[str, list[str] | None]:
+    """Return the options chosen for each group; None takes the group out.
+
+    Args:
+        parsed: all overrides.
+        groups: groups and their options.
+        problems: where unknown options are noted; those choices are left out.
+    """
+    chosen: dict[str, list[str] | None] = {}
+    for override in parsed:
+        group = override.key_or_group
+        if group not in groups:
+            continue
+        if override.is_delete():
+            chosen[group] = None
+            continue
+        value = override.value()
+        options = [str(v) for v in (value if isinstance(value, list) else [value])]
+        # A list, so that every wrong option is noted, not only the first.
+        good = [check_option(group, option, groups, problems) for option in options]
+        if all(good):
+            chosen[group] = options
+    return chosen
+
+
+def hydra_choices(
+    chosen: Mapping[str, list[str] | None], named: Collection[str]
+) -> list[str]:
+    """Write group choices as Hydra overrides.
+
+    Args:
+        chosen: options a group; None takes the group out.
+        named: groups in the recipe's own defaults list. Others are appended, which
+            puts them behind `_self_`.
+    """
+    texts: list[str] = []
+    for group, options in chosen.items():
+        if options is None:
+            texts += [f"~{group}"] if group in named else []
+        else:
+            add = "" if group in named else "+"
+            value = options[0] if len(options) == 1 else f"[{','.join(options)}]"
+            texts.append(f"{add}{group}={value}")
+    return texts
+
+
+def apply_values(
+    config: DictConfig,
+    parsed: Sequence[Override],
+    groups: Groups,
+    problems: list[str],
+) -> None:
+    """Apply the overrides that set or delete a value, in place."""
+    for override in parsed:
+        key = override.key_or_group
+        if key in groups:
+            continue
+        try:
+            if override.is_delete():
+                _delete(config, key)
+            else:
+                OmegaConf.update(config, key, override.value(), force_add=True)
+        except (OmegaConfBaseException, KeyError, TypeError, AttributeError) as error:
+            detail = error.args[0] if isinstance(error, KeyError) else "no such place"
+            problems.append(f"override '{override.input_line}': {detail}")
+
+
+def _delete(config: DictConfig, key: str) -> None:
+    parent_key, _, name = key.rpartition(".")
+    parent = OmegaConf.select(config, parent_key) if parent_key else config
+    known = [str(k) for k in parent] if isinstance(parent, DictConfig) else []
+    if name not in known:
+        allowed = f" There are: {', '.join(known)}." if known else ""
+        raise KeyError(f"{key} does not exist.{nearest(name, known)}{allowed}")
+    del parent[name]
 
 
 def compose(
@@ -162,3 +369,31 @@ def _to_container(config: DictConfig, problems: list[str]) -> dict[str, Any]:
         problems.append(" ".join(str(error).split()))
         data = OmegaConf.to_container(config, resolve=False)
     return {str(k): v for k, v in data.items()} if isinstance(data, dict) else {}
+
+
+def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
+    """Compose every recipe; all problems of all files are raised together.
+
+    Args:
+        paths: recipe names, files or folders (the YAML files at their top level).
+
+    Returns:
+        The files that were checked.
+    """
+    files = [file for path in paths for file in _files(path)]
+    problems = []
+    for file in files:
+        _, found = inspect_recipe(file)
+        problems += [f"{file}: {problem}" for problem in found]
+    if problems:
+        raise RecipeError(problems, where=f"{len(files)} recipes checked")
+    return files
+
+
+def _files(path: str | Path) -> list[Path]:
+    if not Path(path).is_dir():
+        return [find_recipe(path)]
+    files = sorted(Path(path).glob("*.yaml"))
+    if not files:
+        raise FlashdexError(f"{path}: no recipe (*.yaml) in this folder")
+    return files

@@ -9,8 +9,8 @@ from typing import Literal
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
-from flashdex.recipe.algo import LoggerConfig, TrainConfig
 from flashdex.recipe.motions import MotionsConfig
+from flashdex.recipe.run import LoggerConfig, TrainConfig
 from flashdex.system.fields import number
 
 

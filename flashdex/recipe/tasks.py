@@ -1,0 +1,374 @@
+"""The kinds of recipes: what can be trained, told apart by the key ``task``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+
+import flashdex.hands
+from flashdex.algorithms.config import AlgoConfig
+from flashdex.envs.config import GymConfig
+from flashdex.envs.mdp.options import REGISTRY, default_mapping
+from flashdex.errors import FlashdexError, nearest
+from flashdex.recipe.run import LoopConfig
+from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
+
+
+def known_hands() -> list[str]:
+    """Return the names of the built-in hands (folders with a left and a right MJCF)."""
+    root = Path(flashdex.hands.__path__[0])
+    return sorted(path.parent.name for path in root.glob("*/left.xml"))
+
+
+def find_conflicts(recipe: Recipe) -> list[str]:
+    """Return one line for each thing that does not fit together."""
+    checks = (_hand, _motions, _rate, _replay, _algo, _env, _expect)
+    return [problem for check in checks for problem in check(recipe)]
+
+
+def _hand(recipe: Recipe) -> list[str]:
+    known = known_hands()
+    if recipe.hand in known:
+        return []
+    close = nearest(recipe.hand, known)
+    return [f"hand: '{recipe.hand}' is not a hand.{close} Known: {', '.join(known)}."]
+
+
+def _motions(recipe: Recipe) -> list[str]:
+    motions = recipe.motions
+    if motions.library is None and motions.source is None:
+        return [
+            "motions: neither library nor source is given; set motions.library to a "
+            "prepared folder or motions.source to procedural"
+        ]
+    if motions.library is not None:
+        return []
+    if motions.source not in ("procedural", "myodm") and motions.input is None:
+        return [f"motions.input: missing; the source '{motions.source}' reads a folder"]
+    return []
+
+
+def _rate(recipe: Recipe) -> list[str]:
+    physics, hz = recipe.physics, recipe.motions.control_hz
+    step = physics.decimation * physics.timestep
+    if abs(step * hz - 1) < 1e-3:
+        return []
+    return [
+        f"physics.timestep: {physics.decimation} substeps of {physics.timestep:.6g} s "
+        f"make {step:.6g} s, but motions.control_hz={hz:g} asks for {1 / hz:.6g} s; "
+        f"set physics.timestep={1 / hz / physics.decimation:.8g}"
+    ]
+
+
+def _replay(recipe: Recipe) -> list[str]:
+    return replay_conflicts(
+        recipe.algo,
+        total_env_steps=recipe.total_env_steps,
+        num_envs=recipe.env.num_envs,
+        where="env.num_envs",
+    )
+
+
+def replay_conflicts(
+    algo: AlgoConfig, *, total_env_steps: int, num_envs: int, where: str
+) -> list[str]:
+    """Return what does not fit between replay buffer, budget and worlds.
+
+    Args:
+        algo: sizes of the buffer.
+        total_env_steps: budget.
+        num_envs: worlds.
+        where: key that gives the worlds, for the message.
+    """
+    if algo.kind == "ppo":
+        return []  # no replay
+    problems = []
+    if algo.min_buffer > algo.buffer_size:
+        problems.append(
+            f"algo.min_buffer: {algo.min_buffer} rows never fit in algo.buffer_size="
+            f"{algo.buffer_size}; learning would not start"
+        )
+    if algo.min_buffer >= total_env_steps > 1:
+        problems.append(
+            f"algo.min_buffer: {algo.min_buffer} rows of random actions use up "
+            f"total_env_steps={total_env_steps}"
+        )
+    # The newest n steps of every world have no complete return yet.
+    if algo.buffer_size <= num_envs * algo.n_step:
+        problems.append(
+            f"algo.buffer_size: {algo.buffer_size} must exceed {where} x "
+            f"algo.n_step = {num_envs * algo.n_step}"
+        )
+    return problems
+
+
+def _algo(recipe: Recipe) -> list[str]:
+    algo = recipe.algo
+    problems = rate_conflicts(algo)
+    if len(algo.future_channels) != 3 or min(algo.future_channels) < 1:
+        problems.append(
+            f"algo.future_channels: expected three positive numbers, found "
+            f"{algo.future_channels}"
+        )
+    return problems
+
+
+def rate_conflicts(algo: AlgoConfig) -> list[str]:
+    """Return what does not fit between the learning rates."""
+    if algo.lr_final > algo.lr:
+        return [f"algo.lr_final: {algo.lr_final} is above algo.lr={algo.lr}"]
+    return []
+
+
+def _env(recipe: Recipe) -> list[str]:
+    env = recipe.env
+    problems = []
+    if env.attempt_share > 0 and round(env.attempt_share * env.num_envs) == 0:
+        problems.append(
+            f"env.attempt_share: {env.attempt_share} of {env.num_envs} worlds is none, "
+            f"so nothing could ever be converted; give at least {1 / env.num_envs:.3g}"
+        )
+    if not any(options is not None for options in env.transforms.values()):
+        problems.append("env.transforms: all are off; the policy would see nothing")
+    if env.attempt_share >= 1:
+        problems.append(
+            "env.attempt_share: 1 leaves no world to explore; use less than 1"
+        )
+    has_object_term = any(
+        env.rewards.get(name) is not None for name in ("object_points", "object_pose")
+    )
+    if env.terminations.get("early_reset") is not None and not has_object_term:
+        problems.append(
+            "env.terminations.early_reset: it sums the object term, but the rewards "
+            "object_points and object_pose are both off; turn one on"
+        )
+    return problems
+
+
+def _expect(recipe: Recipe) -> list[str]:
+    return expect_conflicts(recipe.expect)
+
+
+def expect_conflicts(entries: list[Expectation]) -> list[str]:
+    """Return the promises that promise nothing."""
+    return [
+        f"expect[{i}]: give min, max or both"
+        for i, entry in enumerate(entries)
+        if entry.min is None and entry.max is None
+    ]
+
+
+# Keys of `algo` that speak of hands or of the future window.
+HAND_ONLY = (
+    "groups",
+    "critic_action",
+    "own_action_gate",
+    "future_latent",
+    "future_channels",
+    "ppo",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GymRecipe(RunRecipe):
+    """One training run on a stock environment, complete.
+
+    Example:
+        >>> GymRecipe(name="tiny", total_env_steps=1000).gym.num_envs
+        1
+    """
+
+    task: Literal["gym"] = "gym"
+    """What is trained: a stock environment; must be given."""
+    gym: GymConfig = dataclasses.field(default_factory=GymConfig)
+    """Environment."""
+    algo: AlgoConfig = dataclasses.field(default_factory=AlgoConfig)
+    """Learner."""
+    train: LoopConfig = dataclasses.field(default_factory=LoopConfig)
+    """Loop."""
+
+    @property
+    def tags(self) -> list[str]:
+        """Words that tell this run from others."""
+        return [self.gym.env_id]
+
+    @property
+    def schedule_env_steps(self) -> int:
+        """Env steps that the learning rate is laid out for."""
+        return self.gym.schedule_env_steps or self.total_env_steps
+
+
+def find_gym_conflicts(recipe: GymRecipe) -> list[str]:
+    """Return one line for each thing that does not fit together."""
+    return [
+        *_environment(recipe),
+        *_hand_keys(recipe.algo),
+        *replay_conflicts(
+            recipe.algo,
+            total_env_steps=recipe.total_env_steps,
+            num_envs=recipe.gym.num_envs,
+            where="gym.num_envs",
+        ),
+        *rate_conflicts(recipe.algo),
+        *expect_conflicts(recipe.expect),
+    ]
+
+
+def _environment(recipe: GymRecipe) -> list[str]:
+    gym = recipe.gym
+    problems = []
+    if not gym.env_id:
+        problems.append("gym.env_id: missing; every recipe with task: gym must give it")
+    if ":" in gym.env_id:
+        problems.append(
+            f"gym.env_id: '{gym.env_id}' names a module to import; recipes name "
+            "registered environments only"
+        )
+    if recipe.schedule_env_steps < recipe.total_env_steps:
+        problems.append(
+            f"gym.schedule_env_steps: {gym.schedule_env_steps} ends before "
+            f"total_env_steps={recipe.total_env_steps}"
+        )
+    return problems
+
+
+def _hand_keys(algo: AlgoConfig) -> list[str]:
+    plain = AlgoConfig()
+    problems = []
+    if algo.kind != "flashsac":
+        problems.append(
+            f"algo.kind: '{algo.kind}' is not available with task: gym; use flashsac"
+        )
+    return problems + [
+        f"algo.{key}: has no effect with task: gym, which has neither hands nor a "
+        "future window; leave it out"
+        for key in HAND_ONLY
+        if getattr(algo, key) != getattr(plain, key)
+    ]
+
+
+R = TypeVar("R", bound=RunRecipe)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of recipe."""
+
+    root: type[RunRecipe]
+    """Its schema."""
+    find_conflicts: Callable[[Any], list[str]]
+    """Says what does not fit together in one."""
+    base: dict[str, Any]
+    """What its files are merged onto: all named parts with no option set."""
+
+
+DEFAULT_TASK = "retarget"
+KINDS: dict[str, Kind] = {
+    DEFAULT_TASK: Kind(
+        root=Recipe,
+        find_conflicts=find_conflicts,
+        base={"env": {kind: default_mapping(kind) for kind in REGISTRY}},
+    ),
+    "gym": Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, base={}),
+}
+
+
+def kind_of(data: Mapping[str, Any]) -> Kind:
+    """Return the kind a mapping asks for; an unknown task counts as the default."""
+    return KINDS.get(str(data.get("task")), KINDS[DEFAULT_TASK])
+
+
+def split_foreign(
+    data: Mapping[str, Any], problems: list[str]
+) -> tuple[Kind, dict[str, Any]]:
+    """Find the kind of a recipe and take out what belongs to another kind.
+
+    Args:
+        data: the composed recipe.
+        problems: where an unknown task and foreign keys are noted.
+
+    Returns:
+        The kind, and the mapping without foreign keys and unknown tasks.
+    """
+    kept = dict(data)
+    task = data.get("task", DEFAULT_TASK)
+    if task not in KINDS:
+        problems.append(
+            f"task: {task!r} is not a task.{nearest(str(task), KINDS)} "
+            f"Allowed: {', '.join(KINDS)}."
+        )
+        kept.pop("task")
+        task = DEFAULT_TASK
+    own = _keys(KINDS[task])
+    for key in data:
+        homes = [name for name, kind in KINDS.items() if key in _keys(kind)]
+        if key not in own and homes:
+            problems.append(
+                f"{key}: belongs to recipes with task: {homes[0]}, this one has "
+                f"task: {task}; take it out"
+            )
+            kept.pop(key)
+    return KINDS[task], kept
+
+
+def mark_groups(data: Mapping[str, Any], groups: Iterable[str]) -> dict[str, Any]:
+    """Add the groups that belong to another kind, or one without a value passes unseen.
+
+    Args:
+        data: the composed recipe.
+        groups: those it chose an option of.
+    """
+    own = _keys(kind_of(data))
+    return {**{group: None for group in groups if group not in own}, **data}
+
+
+def _keys(kind: Kind) -> set[str]:
+    return {field.name for field in dataclasses.fields(kind.root)}
+
+
+def expect_kind(recipe: RunRecipe, root: type[R], *, where: str) -> R:
+    """Return the recipe if it is of one kind.
+
+    Args:
+        recipe: any validated recipe.
+        root: schema of the kind that is needed.
+        where: who needs it, for the message.
+
+    Raises:
+        FlashdexError: it is of another kind.
+    """
+    if isinstance(recipe, root):
+        return recipe
+    wanted = next(name for name, kind in KINDS.items() if kind.root is root)
+    raise FlashdexError(
+        f"{where}: needs a recipe with task: {wanted}; '{recipe.name}' is of another "
+        "kind. `flashdex ls` says what each recipe trains."
+    )
+
+
+def task_of_run(run_dir: Path) -> str:
+    """Return the task of a run directory; the default where none is stated."""
+    try:
+        data = yaml.safe_load((run_dir / "recipe.yaml").read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError):
+        return DEFAULT_TASK  # the verb itself says what is wrong with the folder
+    task = data.get("task") if isinstance(data, dict) else None
+    return task if task in KINDS else DEFAULT_TASK
+
+
+def require_motions(run_dir: Path) -> None:
+    """Refuse a run that has none.
+
+    Raises:
+        FlashdexError: it trains on a stock environment.
+    """
+    if task_of_run(run_dir) == "gym":
+        raise FlashdexError(
+            f"{run_dir}: a run with task: gym has no motions. Its figures are in "
+            "metrics.jsonl; `flashdex evaluate` makes new ones."
+        )

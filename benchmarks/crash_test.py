@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.hands.spec import load_hand
+from flashdex.rollouts.replay import replay
 from flashdex.system.jsonl import read_lines
 from flashdex.training.checkpoint import has_checkpoint, load_checkpoint
-from flashdex.training.replay_run import replay
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from synthetic import write_library

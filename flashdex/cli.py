@@ -239,7 +239,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     from flashdex.recipe import require_motions
-    from flashdex.training.replay_run import replay
+    from flashdex.rollouts.replay import replay
     from flashdex.viz.table import replay_line
 
     require_motions(args.run_dir)
@@ -251,7 +251,7 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _score(args: argparse.Namespace) -> int:
     from flashdex.metrics.criteria import score
-    from flashdex.metrics.rollout import Rollout
+    from flashdex.rollouts.rollout import Rollout
     from flashdex.viz.table import score_table
 
     found = {}

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from flashdex.keys import FINGERS
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 
 FRAMES, DECIMATION = 90, 4
 SITES = "".join(

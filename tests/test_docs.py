@@ -147,7 +147,7 @@ def test_run_page_names_every_file(tiny_run):
 def test_run_page_names_exactly_the_keys_of_a_rollout():
     import dataclasses
 
-    from flashdex.metrics.rollout import Rollout
+    from flashdex.rollouts.rollout import Rollout
 
     keys = {field.name for field in dataclasses.fields(Rollout)} | {"schema"}
     assert keys == first_cells("runs.md", "rollouts")
@@ -156,7 +156,7 @@ def test_run_page_names_exactly_the_keys_of_a_rollout():
 def test_run_page_names_exactly_the_parts_of_a_certificate():
     import dataclasses
 
-    from flashdex.metrics.certificate import Certificate
+    from flashdex.rollouts.certificate import Certificate
 
     parts = {field.name for field in dataclasses.fields(Certificate)}
     assert parts == first_cells("runs.md", "Certificates")

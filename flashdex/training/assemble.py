@@ -18,13 +18,13 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
 from flashdex.replay.disk import ReplayLog, replay_of
+from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder, Judging
 from flashdex.system.files import write_atomic
 from flashdex.system.machine import versions
-from flashdex.training.attempts import AttemptMaker
 from flashdex.training.baselines import score_baselines
 from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
-from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder, Judging
-from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
 from flashdex.training.sessions import Start, begin_session

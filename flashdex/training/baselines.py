@@ -14,8 +14,8 @@ from torch import Tensor
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.errors import frozen_object
+from flashdex.rollouts.build import grace_steps
 from flashdex.system.files import write_atomic
-from flashdex.training.attempts import grace_steps
 from flashdex.training.rollouts import roll_all
 from flashdex.training.setup import Workbench
 

@@ -19,8 +19,10 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe
 from flashdex.replay.disk import ReplayLog
+from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.recorder import AttemptRing, Episode
+from flashdex.rollouts.scorer import Judging
 from flashdex.training.alongside import Alongside
-from flashdex.training.attempt_ring import AttemptRing, Episode
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -28,8 +30,6 @@ from flashdex.training.guard import (
     first_non_finite,
     numeric_errors,
 )
-from flashdex.training.judging import Judging
-from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop_state import load_loop_state, loop_state
 from flashdex.training.nan_dump import stop_with_dump

@@ -17,8 +17,8 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import build_scenes
 from flashdex.hands.spec import load_hand
 from flashdex.recipe import Recipe
+from flashdex.rollouts.recorder import LOOK_EVERY
 from flashdex.system.machine import Pool
-from flashdex.training.attempt_ring import LOOK_EVERY
 from flashdex.training.memory_learner import LearnerSizes
 from flashdex.training.memory_library import (
     STAND_IN_FRAMES,
@@ -112,7 +112,7 @@ class PartSizes:
         return measure_warp(self.library, self.hands, self.recipe.physics)
 
     def ring_bytes(self, recipe: Recipe, *, device: Pool) -> int:
-        """`flashdex.training.attempt_ring`: the last steps of the attempt worlds.
+        """`flashdex.rollouts.recorder`: the last steps of the attempt worlds.
 
         Args:
             recipe: worlds, episode length and engine.

@@ -6,8 +6,8 @@ import logging
 
 from flashdex.algorithms.base import Learner
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.training.judging import Judging
-from flashdex.training.ledger import Ledger
+from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.scorer import Judging
 
 _LOG = logging.getLogger(__name__)
 _ROOM = {

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.training.attempt_ring import AttemptRing
-from flashdex.training.attempts import Attempt
+from flashdex.rollouts.build import Attempt
+from flashdex.rollouts.recorder import AttemptRing
 from flashdex.training.setup import Workbench
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]

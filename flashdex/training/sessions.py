@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
-from flashdex.training.ledger import CONVERSIONS
 from flashdex.training.logging import METRICS
 
 SESSIONS = "sessions.jsonl"

@@ -25,8 +25,8 @@ from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
+from flashdex.rollouts.build import AttemptMaker
 from flashdex.system.machine import versions
-from flashdex.training.attempts import AttemptMaker
 from flashdex.training.collection import load_library, select_motions
 
 _LOG = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 
 MARGIN = 0.08  # m, kept free around every point: hands and objects have a size
 MIN_DISTANCE = 0.35  # m

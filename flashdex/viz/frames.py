@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from flashdex.errors import FlashdexError
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 from flashdex.viz.camera import fit_view, moving_points, view_axes
 
 WIDTH, HEIGHT = 512, 384  # multiples of 16, as the encoder wants them

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from flashdex.errors import RunError, UnknownNameError
-from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria_table import criterion_names
-from flashdex.metrics.perturbation import Perturbation
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.perturbation import Perturbation
+from flashdex.rollouts.rollout import Rollout
 
 
 def moved(rollout):
@@ -85,7 +85,7 @@ def test_perturbations_beyond_the_limits_are_certified_not_robust(build_rollout)
 
 
 def test_six_of_eight_is_the_line(rollout):
-    from flashdex.metrics import certificate as module
+    from flashdex.rollouts import certificate as module
 
     nominal = certify(rollout, num_perturbations=0)
     assert nominal.verdict == "certified"

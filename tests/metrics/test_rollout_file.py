@@ -8,7 +8,7 @@ import pytest
 
 from flashdex.errors import RunError
 from flashdex.metrics.criteria import score
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 
 
 @pytest.fixture

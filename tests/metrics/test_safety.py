@@ -4,14 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from flashdex.metrics.perturbation import (
+from flashdex.rollouts.perturbation import (
     Perturbation,
     control_range,
     perturb,
     perturb_state,
 )
-from flashdex.metrics.resimulation import load_scene, resimulate
-from flashdex.metrics.safety import (
+from flashdex.rollouts.resimulation import load_scene, resimulate
+from flashdex.rollouts.safety import (
     SafetyMonitor,
     geom_kinds,
     joint_limit_violations,

@@ -13,10 +13,10 @@ from torchrl.envs.utils import step_mdp
 from flashdex import keys
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import AssistConfig
-from flashdex.training.attempt_ring import LOOK_EVERY, AttemptRing
+from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.recorder import LOOK_EVERY, AttemptRing
+from flashdex.rollouts.scorer import JudgeHere
 from flashdex.training.guard import GradientGuard
-from flashdex.training.judging import JudgeHere
-from flashdex.training.ledger import Ledger
 from flashdex.training.logging import MetricLog
 from flashdex.training.loop import Trainer
 from flashdex.training.sessions import Start

@@ -14,12 +14,12 @@ import torch
 from flashdex import keys
 from flashdex.errors import RunError
 from flashdex.recipe import MotionsConfig
+from flashdex.rollouts.ledger import CONVERSIONS, Ledger
+from flashdex.rollouts.recorder import AttemptRing
+from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder
 from flashdex.system.jsonl import read_lines
 from flashdex.system.machine import versions
 from flashdex.training.assemble import start_judge
-from flashdex.training.attempt_ring import AttemptRing
-from flashdex.training.judging import JudgeBeside, JudgeHere, JudgeOrder
-from flashdex.training.ledger import CONVERSIONS, Ledger
 
 
 def die(order):
@@ -120,8 +120,8 @@ from types import SimpleNamespace
 sys.path[:0] = {folders!r}
 import numpy as np
 from test_judging import cannot_write, die
-from flashdex.training.attempt_ring import Episode
-from flashdex.training.judging import JudgeBeside, JudgeOrder
+from flashdex.rollouts.recorder import Episode
+from flashdex.rollouts.scorer import JudgeBeside, JudgeOrder
 
 if __name__ == "__main__":
     start = {{"die": die, "error": cannot_write, "backlog": die}}[sys.argv[1]]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from flashdex.metrics.certificate import certify
-from flashdex.metrics.rollout import Rollout
-from flashdex.training.ledger import CONVERSIONS, Ledger, read_lines
+from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.ledger import CONVERSIONS, Ledger, read_lines
+from flashdex.rollouts.rollout import Rollout
 
 REQUIRED = {
     "motion": str,

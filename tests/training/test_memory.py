@@ -120,7 +120,7 @@ def test_the_bank_is_exact(trained):
 
 
 def test_the_rings_of_attempts_are_exact(trained):
-    from flashdex.training.attempt_ring import AttemptRing
+    from flashdex.rollouts.recorder import AttemptRing
 
     env, _, plan = trained(attempt_share=0.5)
     ring = AttemptRing(env)

@@ -16,12 +16,12 @@ import torch
 
 from flashdex.cli import main
 from flashdex.errors import RunError
-from flashdex.metrics.rollout import Rollout
 from flashdex.replay.disk import ReplayLog
+from flashdex.rollouts.ledger import CONVERSIONS, Ledger
+from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import run_lock
 from flashdex.system.jsonl import append_line, keep_lines, read_lines
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
-from flashdex.training.ledger import CONVERSIONS, Ledger
 from flashdex.training.run import resume
 from flashdex.training.sessions import SESSIONS, begin_session, end_session, ended_by
 from flashdex.training.signals import StopSignals

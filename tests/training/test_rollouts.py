@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from flashdex import keys
-from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
-from flashdex.metrics.resimulation import load_scene, resimulate
-from flashdex.metrics.rollout import Rollout
-from flashdex.training.attempt_ring import AttemptRing
-from flashdex.training.attempts import AttemptMaker
+from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.recorder import AttemptRing
+from flashdex.rollouts.resimulation import load_scene, resimulate
+from flashdex.rollouts.rollout import Rollout
 
 
 def shaky(scale, seed=0):

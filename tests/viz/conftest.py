@@ -9,7 +9,7 @@ import yaml
 from pushed_box import make_rollout
 
 from flashdex.cli import main
-from flashdex.metrics.certificate import certify
+from flashdex.rollouts.certificate import certify
 
 EVIL = '<script>alert("x")</script> & co'
 

@@ -18,7 +18,7 @@ from flashdex.viz.report import write_report
 
 DRAW = """
 import sys, numpy as np
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 from flashdex.viz.frames import Painter
 painter = Painter(Rollout.load(sys.argv[1]))
 np.save(sys.argv[2], painter.draw(20))

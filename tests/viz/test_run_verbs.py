@@ -7,7 +7,7 @@ import pytest
 
 from flashdex.cli import _show_run
 from flashdex.metrics.criteria import score
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 
 
 def test_report_rewrites_the_page(call, run_dir):

@@ -12,11 +12,11 @@ import numpy as np
 
 from flashdex import keys
 from flashdex.errors import RunError
-from flashdex.metrics.certificate import certify
 from flashdex.metrics.criteria import score
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.build import Attempt
+from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.rollout import Rollout
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
-from flashdex.training.attempts import Attempt
 
 _LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"

@@ -18,16 +18,16 @@ import numpy as np
 
 from flashdex.metrics.criteria import resolve_criterion, score
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
-from flashdex.metrics.perturbation import Perturbation, perturb
-from flashdex.metrics.resimulation import (
+from flashdex.rollouts.perturbation import Perturbation, perturb
+from flashdex.rollouts.resimulation import (
     Replay,
     Scene,
     load_scene,
     model_hash,
     resimulate,
 )
-from flashdex.metrics.rollout import Rollout
-from flashdex.metrics.safety import (
+from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.safety import (
     SafetyMonitor,
     assist_sources,
     joint_limit_violations,

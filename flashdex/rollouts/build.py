@@ -16,8 +16,8 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.metrics.rollout import Rollout
-from flashdex.training.attempt_ring import Episode
+from flashdex.rollouts.recorder import Episode
+from flashdex.rollouts.rollout import Rollout
 
 GRACE_S = 0.25  # s; 15 steps at 60 Hz, as the criteria define it
 

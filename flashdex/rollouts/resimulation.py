@@ -17,7 +17,7 @@ import numpy as np
 from flashdex.errors import RunError
 from flashdex.keys import FINGERS, SIDES
 from flashdex.metrics.errors import Signals, compute_signals
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout
 
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200

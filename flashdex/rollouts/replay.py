@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flashdex.errors import RunError
-from flashdex.metrics.certificate import certify
-from flashdex.metrics.rollout import Rollout
-from flashdex.training.ledger import CONVERSIONS, ROLLOUTS, read_lines
+from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.ledger import CONVERSIONS, ROLLOUTS, read_lines
+from flashdex.rollouts.rollout import Rollout
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.training.attempt_ring import Episode
-from flashdex.training.attempts import AttemptMaker
-from flashdex.training.ledger import Conversion, Ledger
+from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.ledger import Conversion, Ledger
+from flashdex.rollouts.recorder import Episode
 
 if TYPE_CHECKING:
     from flashdex.recipe import Recipe

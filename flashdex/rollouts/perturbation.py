@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from flashdex.metrics.resimulation import Scene
-from flashdex.metrics.rollout import Rollout
+from flashdex.rollouts.resimulation import Scene
+from flashdex.rollouts.rollout import Rollout
 
 
 @dataclass(frozen=True)

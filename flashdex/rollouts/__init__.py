@@ -1,0 +1,1 @@
+"""Episodes as recorded, rollouts as stored, the ledger and the certificate."""

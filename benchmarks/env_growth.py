@@ -22,7 +22,7 @@ from flashdex.bench.output import add_output_options, emit
 from flashdex.bench.turns import TurnTaker
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.setup import open_workbench
+from flashdex.training.build import open_workbench
 
 STEPS = 8  # control steps of a turn
 # objects, hulls, worlds; the first one is what the others are compared with

@@ -211,7 +211,7 @@ def _train(args: argparse.Namespace) -> int:
 
 def _show_run(run_dir: Path) -> bool:
     """Show what a run came to; False when a signal ended it, which is no time to."""
-    from flashdex.training.sessions import SIGNAL, ended_by
+    from flashdex.training.session import SIGNAL, ended_by
     from flashdex.viz.summary import run_summary
 
     if ended_by(run_dir) == SIGNAL:

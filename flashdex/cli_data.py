@@ -139,7 +139,7 @@ def _list_recordings(order: Order) -> int:
 def _baselines(args: argparse.Namespace) -> int:
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.baselines import format_baselines, score_baselines
-    from flashdex.training.setup import open_workbench
+    from flashdex.training.build import open_workbench
 
     recipe = compose(args.recipe, args.overrides)
     bench = open_workbench(expect_kind(recipe, Recipe, where="baselines"))

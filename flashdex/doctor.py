@@ -79,10 +79,10 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
         FlashdexError: the recipe has mistakes or trains no motions.
     """
     from flashdex.recipe import Recipe, compose, expect_kind
+    from flashdex.training.build import learner_device
     from flashdex.training.memory import plan_memory
     from flashdex.training.memory_text import format_cards, format_plan, format_work
-    from flashdex.training.run import default_run_dir
-    from flashdex.training.setup import learner_device
+    from flashdex.training.run_dir import default_run_dir
 
     recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")
     # of a recipe for a GPU the need is of interest also where there is none

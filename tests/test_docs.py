@@ -62,7 +62,7 @@ def run_tiny(library, tmp_path_factory):
     from flashdex.recipe import Recipe, validate
     from flashdex.recipe.motions import MotionsConfig
     from flashdex.recipe.run import TrainConfig
-    from flashdex.training.run import train
+    from flashdex.training.run_dir import train
 
     def run(groups, kind="flashsac"):
         folder = tmp_path_factory.mktemp("runs") / f"{groups}-{kind}"

@@ -16,7 +16,7 @@ from flashdex.bench.output import add_output_options, emit
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.setup import Workbench, open_workbench
+from flashdex.training.build import Workbench, open_workbench
 
 
 def main(words: list[str] | None = None) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.setup import open_workbench
+from flashdex.training.build import open_workbench
 
 ROWS_PER_BATCH = 8  # replay rows collected before measuring, in batches
 BURN_IN = 4

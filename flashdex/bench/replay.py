@@ -25,7 +25,7 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
 from flashdex.replay.codec import row_bytes
-from flashdex.training.setup import learner_device, open_workbench
+from flashdex.training.build import learner_device, open_workbench
 
 SOURCE_WORLDS = 64  # of the environment whose rows are copied into the ring
 SOURCE_STEPS = 24

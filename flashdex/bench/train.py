@@ -23,8 +23,8 @@ from flashdex.bench.turns import physics_rate, room_used
 from flashdex.recipe import Recipe
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.training.assemble import BASELINES, make_trainer
-from flashdex.training.loop import Trainer
-from flashdex.training.setup import open_workbench
+from flashdex.training.build import open_workbench
+from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too
 # No certificates, films or checkpoints, an actor that steps from the start, and a loop

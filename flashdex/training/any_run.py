@@ -25,7 +25,7 @@ def train(recipe: RunRecipe) -> Path:
         from flashdex.training.gym_run import train_gym
 
         return train_gym(recipe)
-    from flashdex.training.run import train as train_retarget
+    from flashdex.training.run_dir import train as train_retarget
 
     return train_retarget(expect_kind(recipe, Recipe, where="train"))
 
@@ -57,6 +57,6 @@ def resume(run_dir: Path, overrides: list[str]) -> Path:
         from flashdex.training.gym_run import resume_gym
 
         return resume_gym(run_dir, overrides)
-    from flashdex.training.run import resume as resume_retarget
+    from flashdex.training.run_dir import resume as resume_retarget
 
     return resume_retarget(run_dir, overrides)

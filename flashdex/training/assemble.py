@@ -24,11 +24,11 @@ from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder, Judging
 from flashdex.system.files import write_atomic
 from flashdex.system.machine import versions
 from flashdex.training.baselines import score_baselines
+from flashdex.training.build import Workbench, open_workbench
 from flashdex.training.checkpoint import checkpoint_name, checkpoint_names
 from flashdex.training.logging import MetricLog
-from flashdex.training.loop import Trainer
-from flashdex.training.sessions import Start, begin_session
-from flashdex.training.setup import Workbench, open_workbench
+from flashdex.training.session import Start, begin_session
+from flashdex.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)
 RECIPE, BASELINES = "recipe.yaml", "baselines.json"

@@ -16,8 +16,8 @@ from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.errors import frozen_object
 from flashdex.rollouts.build import grace_steps
 from flashdex.system.files import write_atomic
-from flashdex.training.rollouts import roll_all
-from flashdex.training.setup import Workbench
+from flashdex.training.build import Workbench
+from flashdex.training.evaluator import roll_all
 
 
 @dataclass(frozen=True)

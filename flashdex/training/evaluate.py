@@ -15,11 +15,11 @@ from flashdex.metrics.aggregate import mean_object_errors, mope_more
 from flashdex.metrics.criteria import score
 from flashdex.system.files import write_atomic
 from flashdex.training.assemble import restore
+from flashdex.training.build import open_workbench
 from flashdex.training.checkpoint import EVALUATED, load_checkpoint
-from flashdex.training.fixed import stored_value
-from flashdex.training.rollouts import roll_all
-from flashdex.training.run import load_run_recipe
-from flashdex.training.setup import open_workbench
+from flashdex.training.evaluator import roll_all
+from flashdex.training.run_dir import load_run_recipe
+from flashdex.training.session import stored_value
 
 SHOWN = ("sr_mt_obj", "sr_mt", "sr_spider_raw", "sr_spider_centred")
 

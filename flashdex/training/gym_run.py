@@ -26,11 +26,11 @@ from flashdex.training.checkpoint import (
     remove_temporaries,
     set_aside_newer,
 )
-from flashdex.training.gym_evaluate import evaluate_recipe
-from flashdex.training.gym_loop import GymTrainer
+from flashdex.training.evaluator import evaluate_recipe
+from flashdex.training.gym_trainer import GymTrainer
 from flashdex.training.logging import MetricLog
-from flashdex.training.run import RECIPE, create_run_dir, default_run_dir
-from flashdex.training.sessions import begin_session, end_session
+from flashdex.training.run_dir import RECIPE, create_run_dir, default_run_dir
+from flashdex.training.session import begin_session, end_session
 
 _LOG = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from flashdex.errors import FlashdexError
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
 from flashdex.system.machine import Machine, Pool, look_at_machine
+from flashdex.training.build import learner_device
 from flashdex.training.memory_library import find_library, read_sizes, worst_sizes
 from flashdex.training.memory_parts import Part, PartSizes, list_parts, replay_pool
-from flashdex.training.setup import learner_device
 
 _LOG = logging.getLogger(__name__)
 TIGHT = 0.9  # share of what is free

@@ -20,7 +20,7 @@ from flashdex.keys import SIDES
 from flashdex.motions.library import NUM_OBJECT_SLOTS, MotionLibrary
 from flashdex.objects.asset import ObjectSettings
 from flashdex.recipe import Recipe
-from flashdex.training.collection import library_name, select_motions
+from flashdex.training.build import library_name, select_motions
 
 # Assumed of recordings that are not prepared yet.
 MOTIONS = 100

@@ -110,7 +110,7 @@ def reopen(path: str | Path) -> tuple[Learner, Callable[[], TensorDictBase]]:
     """
     path = Path(path)
     dump = read_dump(path)
-    from flashdex.training.setup import open_workbench  # loads the simulator
+    from flashdex.training.build import open_workbench  # loads the simulator
 
     with TemporaryDirectory() as folder:
         file = Path(folder) / "recipe.yaml"

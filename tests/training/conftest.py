@@ -27,7 +27,7 @@ TINY = {
 @pytest.fixture
 def make_bench(library, hands, bank):
     """Build a workbench: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
-    from flashdex.training.setup import Workbench
+    from flashdex.training.build import Workbench
 
     def make(num_envs=6, *, algo=None, train=None, **env):
         small = {"object_points": {"num_points": 8}}
@@ -47,8 +47,8 @@ def make_bench(library, hands, bank):
 @pytest.fixture(scope="module")
 def roll_tiny(library, hands, bank):
     """Roll every motion of the synthetic library under a controller."""
-    from flashdex.training.rollouts import roll_all
-    from flashdex.training.setup import Workbench
+    from flashdex.training.build import Workbench
+    from flashdex.training.evaluator import roll_all
 
     recipe = Recipe(
         name="tiny",
@@ -94,7 +94,7 @@ def start_tiny(library):
     Takes ``train`` and ``logger`` settings, and fields of Recipe.
     """
     from flashdex.recipe import LoggerConfig, MotionsConfig, validate
-    from flashdex.training.run import train as start
+    from flashdex.training.run_dir import train as start
 
     def run(folder, *, train=None, logger=None, **fields):
         transforms = {**EnvConfig().transforms, "object_points": {"num_points": 4}}

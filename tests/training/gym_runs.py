@@ -6,10 +6,10 @@ import json
 
 from flashdex.recipe import AlgoConfig, GymConfig, GymRecipe, LoopConfig
 from flashdex.replay.disk import ReplayLog
-from flashdex.training.gym_loop import GymTrainer
 from flashdex.training.gym_run import make_gym_learner
+from flashdex.training.gym_trainer import GymTrainer
 from flashdex.training.logging import MetricLog
-from flashdex.training.sessions import Start
+from flashdex.training.session import Start
 
 TINY = {
     "batch_size": 16,

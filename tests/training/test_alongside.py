@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from flashdex.envs.tracking import few_threads
-from flashdex.training.alongside import Alongside
 from flashdex.training.checkpoint import load_checkpoint
+from flashdex.training.trainer import Alongside
 
 
 @pytest.mark.parametrize("threaded", [True, False])

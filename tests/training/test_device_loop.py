@@ -18,8 +18,8 @@ from flashdex.rollouts.recorder import LOOK_EVERY, AttemptRing
 from flashdex.rollouts.scorer import JudgeHere
 from flashdex.training.guard import GradientGuard
 from flashdex.training.logging import MetricLog
-from flashdex.training.loop import Trainer
-from flashdex.training.sessions import Start
+from flashdex.training.session import Start
+from flashdex.training.trainer import Trainer
 
 
 def unseen(env: TrackingEnv) -> TrackingEnv:

@@ -14,7 +14,7 @@ from flashdex.replay.codec import finite_rows
 from flashdex.training.checkpoint import load_checkpoint
 from flashdex.training.guard import GradientGuard, NonFiniteError, first_non_finite
 from flashdex.training.nan_dump import DUMP, reopen
-from flashdex.training.run import resume
+from flashdex.training.run_dir import resume
 
 BAD = (float("nan"), float("inf"), -float("inf"))
 

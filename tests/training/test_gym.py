@@ -16,7 +16,7 @@ from gym_runs import STEPS, TINY, read_metrics, tiny_recipe, trainer_of
 from flashdex.cli import main
 from flashdex.envs.gym import GymWorlds
 from flashdex.recipe import GymConfig, GymRecipe, compose
-from flashdex.training.gym_evaluate import evaluate_policy, observed
+from flashdex.training.evaluator import evaluate_policy, observed
 from flashdex.training.gym_run import make_gym_learner, train_gym
 
 # The published curves are those of the -v4 environments.

@@ -14,7 +14,7 @@ from gym_runs import read_metrics, tiny_recipe, trainer_of
 from flashdex.cli import main
 from flashdex.errors import FlashdexError, RunError
 from flashdex.training.checkpoint import newest_checkpoint
-from flashdex.training.gym_evaluate import SEED_OFFSET
+from flashdex.training.evaluator import SEED_OFFSET
 from flashdex.training.gym_run import resume_gym, train_gym
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")

@@ -13,8 +13,8 @@ from flashdex.errors import RunError
 from flashdex.recipe import AlgoConfig, Recipe, dump_recipe
 from flashdex.system.files import run_lock
 from flashdex.training.checkpoint import RESUMED, load_checkpoint
-from flashdex.training.fixed import refuse_changes
-from flashdex.training.run import RECIPE, new_run, resume
+from flashdex.training.run_dir import RECIPE, new_run, resume
+from flashdex.training.session import refuse_changes
 
 CHANGES = {
     "algo.kind": "ppo",

@@ -242,7 +242,7 @@ def test_another_algorithm_s_checkpoint_is_refused(make_ppo, make_bench):
 def ppo_run(make_ppo, library, tmp_path):
     """A run of three rollouts, two of them learnt from."""
     from flashdex.recipe import validate
-    from flashdex.training.run import train
+    from flashdex.training.run_dir import train
 
     recipe = dataclasses.replace(
         make_ppo()[0].recipe,
@@ -267,7 +267,7 @@ def test_a_run_trains_and_is_evaluated(ppo_run, library):
 
 
 def test_a_resume_takes_another_learning_rate(ppo_run):
-    from flashdex.training.run import resume
+    from flashdex.training.run_dir import resume
 
     def rates():
         agents = load_checkpoint(ppo_run)["learner"]["agents"]

@@ -22,9 +22,9 @@ from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import run_lock
 from flashdex.system.jsonl import append_line, keep_lines, read_lines
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
-from flashdex.training.run import resume
-from flashdex.training.sessions import SESSIONS, begin_session, end_session, ended_by
-from flashdex.training.signals import StopSignals
+from flashdex.training.run_dir import resume
+from flashdex.training.session import SESSIONS, begin_session, end_session, ended_by
+from flashdex.training.stop_signals import StopSignals
 
 KEYS = ("env_steps", "hours", "updates")
 

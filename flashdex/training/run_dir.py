@@ -25,6 +25,7 @@ from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.files import run_lock, write_atomic
 from flashdex.system.machine import versions
 from flashdex.training.assemble import RECIPE, make_trainer
+from flashdex.training.build import Workbench, learner_device, open_workbench
 from flashdex.training.checkpoint import (
     RESUMED,
     has_checkpoint,
@@ -32,11 +33,9 @@ from flashdex.training.checkpoint import (
     remove_temporaries,
     set_aside_newer,
 )
-from flashdex.training.fixed import refuse_changes
 from flashdex.training.memory import check_memory
 from flashdex.training.memory_library import find_library
-from flashdex.training.sessions import end_session
-from flashdex.training.setup import Workbench, learner_device, open_workbench
+from flashdex.training.session import end_session, refuse_changes
 
 _LOG = logging.getLogger(__name__)
 VERSIONS = "versions.json"

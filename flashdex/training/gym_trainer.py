@@ -16,17 +16,17 @@ from flashdex.errors import RunError
 from flashdex.recipe import GymRecipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.training.checkpoint import newest_checkpoint, save_checkpoint
+from flashdex.training.evaluator import StoppedError, evaluate_recipe, observed
 from flashdex.training.guard import (
     GradientGuard,
     NonFiniteError,
     first_non_finite,
     numeric_errors,
 )
-from flashdex.training.gym_evaluate import StoppedError, evaluate_recipe, observed
-from flashdex.training.gym_stats import GymStats
 from flashdex.training.logging import MetricLog
-from flashdex.training.sessions import SIGNAL, Start
-from flashdex.training.signals import StopSignals
+from flashdex.training.session import SIGNAL, Start
+from flashdex.training.stats import GymStats
+from flashdex.training.stop_signals import StopSignals
 
 _LOG = logging.getLogger(__name__)
 

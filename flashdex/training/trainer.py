@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +14,19 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
+from tqdm import tqdm
 
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.envs.mdp.assist import AssistEpoch
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
-from flashdex.recipe import Recipe
+from flashdex.modules.layers import restore_generator
+from flashdex.recipe import Recipe, dump_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import AttemptRing, Episode
 from flashdex.rollouts.scorer import Judging
-from flashdex.training.alongside import Alongside
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -31,13 +35,209 @@ from flashdex.training.guard import (
     numeric_errors,
 )
 from flashdex.training.logging import MetricLog
-from flashdex.training.loop_state import load_loop_state, loop_state
 from flashdex.training.nan_dump import stop_with_dump
-from flashdex.training.progress import Progress
-from flashdex.training.record import make_record
-from flashdex.training.sessions import SIGNAL, Start
-from flashdex.training.signals import StopSignals
+from flashdex.training.session import SIGNAL, Start
 from flashdex.training.stats import RunningStats
+from flashdex.training.stop_signals import StopSignals
+
+_ROOM = {
+    "contacts": "physics.nconmax",
+    "constraints": "physics.njmax",
+}
+
+
+def make_record(
+    *,
+    env_steps: int,
+    lost: int,
+    wall_s: float,
+    env: TrackingEnv,
+    learner: Learner,
+    ledger: Ledger,
+    judging: Judging,
+) -> dict[str, float]:
+    """What a log record says besides the running means.
+
+    Args:
+        env_steps: counter of the run.
+        lost: env steps lost to crashes.
+        wall_s: seconds of the run, earlier sessions included.
+        env: for the assist and the engine's overflow, which is read and cleared.
+        learner: for updates and buffer.
+        ledger: for conversions.
+        judging: for the attempts in line.
+    """
+    record: dict[str, float] = {
+        "env_steps": env_steps,
+        "env_steps_lost": lost,
+        "hours": wall_s / 3600,
+        "updates": learner.updates,
+        **ledger.metrics(wall_s / 3600),
+        "convert/pending": judging.pending,
+        "buffer/rows": learner.num_rows,
+        "buffer/dropped": float(getattr(learner, "num_dropped", 0)),
+        "assist/level": env.assist.upper[0] if env.assist is not None else 0.0,
+    }
+    for kind, worlds in env.physics.take_overflow().items():
+        record[f"physics/overflow_{kind}"] = worlds
+        _LOG.warning(
+            "%d of %d worlds ran out of room for %s: the engine dropped some, so "
+            "these worlds were wrong for a while%s",
+            worlds,
+            env.num_envs,
+            kind,
+            f". Raise {_ROOM[kind]}" if kind in _ROOM else "",
+        )
+    return record
+
+
+PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal
+
+
+class Progress:
+    """Shows env steps and conversions.
+
+    Args:
+        name: of the recipe.
+        total: env steps of the run.
+        done: of them, those of earlier sessions.
+    """
+
+    def __init__(self, name: str, *, total: int, done: int) -> None:
+        self.total = total
+        # Without a terminal tqdm would fill the log with carriage returns.
+        self._bar = tqdm(
+            total=total,
+            initial=done,
+            unit="step",
+            unit_scale=True,
+            desc=name,
+            disable=None,
+            dynamic_ncols=True,
+        )
+        self._last_line = time.monotonic()
+
+    def update(self, steps: int) -> None:
+        """Advance the bar."""
+        self._bar.update(steps)
+
+    def show(self, note: str, *, env_steps: int, wall_s: float) -> None:
+        """Show a note beside the bar, or log a line if the last one is old enough.
+
+        Args:
+            note: what was achieved.
+            env_steps: of the run.
+            wall_s: seconds of the run.
+        """
+        self._bar.set_postfix_str(note)
+        now = time.monotonic()
+        if self._bar.disable and now - self._last_line >= PLAIN_LOG_S:
+            self._last_line = now
+            _LOG.info(
+                "%d of %d env steps, %s, %.0f s", env_steps, self.total, note, wall_s
+            )
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self._bar.close()
+
+
+class Alongside:
+    """Runs one piece of work while the body of a ``with`` block runs.
+
+    The work and the block must share nothing that either changes; then the outcome is
+    that of the work done first and the block after it, whichever is on.
+
+    Args:
+        threaded: False does just that, one after the other.
+
+    Example:
+        >>> done = []
+        >>> with Alongside(threaded=True).run(lambda: done.append("work")):
+        ...     pass
+        >>> done
+        ['work']
+    """
+
+    def __init__(self, *, threaded: bool) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        if threaded:
+            self._pool = ThreadPoolExecutor(1, "learner")
+            # A thread takes the number that is set when it first asks, and the block
+            # may have lowered it for itself just then: ask now.
+            self._pool.submit(torch.get_num_threads).result()
+
+    @contextmanager
+    def run(self, work: Callable[[], None] | None) -> Iterator[None]:
+        """Do ``work`` beside the block; both have ended when the block is left.
+
+        Args:
+            work: what to do; None is nothing.
+
+        Raises:
+            BaseException: what ``work`` raised, unless the block raised first.
+        """
+        if work is None:
+            yield
+            return
+        if self._pool is None:
+            work()
+            yield
+            return
+        future = self._pool.submit(work)
+        try:
+            yield
+        except BaseException:
+            future.exception()  # waits; the block's own error is the one to show
+            raise
+        future.result()
+
+    def close(self) -> None:
+        """End the thread."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
+def loop_state(trainer: Trainer) -> dict[str, Any]:
+    """Everything a resumed run needs, tensors and plain values only.
+
+    The samplers hold nothing but what the conversions say, and those are in files.
+
+    Args:
+        trainer: between two vector steps, its attempts all judged.
+    """
+    assist = trainer.env.assist
+    return {
+        "env_steps": trainer.env_steps,
+        "vector_steps": trainer.vector_steps,
+        "wall_s": trainer.wall_s,
+        "env_steps_lost": trainer.start.lost,
+        "learner": trainer.learner.state_dict(),
+        "assist": None if assist is None else assist.state_dict(),
+        "assist_epoch": trainer.assist_epoch.state_dict(),
+        "env_generator": trainer.env.generator.get_state(),
+        "torch_rng": torch.get_rng_state(),
+        "ledger_bytes": trainer.ledger.num_bytes,
+        "recipe": dump_recipe(trainer.recipe),
+        "wandb_id": trainer.log.wandb_id,
+    }
+
+
+def load_loop_state(trainer: Trainer, state: dict[str, Any]) -> None:
+    """Restore all of ``loop_state`` but the learner, which is restored already.
+
+    Args:
+        trainer: of a new session.
+        state: from ``loop_state``.
+    """
+    trainer.vector_steps = state["vector_steps"]
+    trainer.assist_epoch.load_state_dict(state["assist_epoch"])
+    if trainer.env.assist is not None and state["assist"] is not None:
+        trainer.env.assist.load_state_dict(state["assist"])
+        trainer.env.redraw_assist()
+    restore_generator(trainer.env.generator, state["env_generator"])
+    torch.set_rng_state(state["torch_rng"])
+
 
 _LOG = logging.getLogger(__name__)
 

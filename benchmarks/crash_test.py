@@ -78,7 +78,7 @@ class Victim:
             words = ["--resume", str(self.run_dir), *overrides]
         with (self.folder / "output.txt").open("ab") as output:
             return subprocess.Popen(
-                [sys.executable, "-m", "flashdex.cli", "train", *words],
+                [sys.executable, "-m", "flashdex.cli.main", "train", *words],
                 cwd=self.folder,
                 stdout=output,
                 stderr=output,

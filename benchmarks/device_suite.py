@@ -156,7 +156,7 @@ def start(words: list[str], scratch: Path, **streams: Any) -> subprocess.Popen[b
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path.rstrip(os.pathsep)}
     env |= {"WANDB_MODE": "offline", "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "flashdex.cli", *words]
+    command = [sys.executable, "-m", "flashdex.cli.main", *words]
     return subprocess.Popen(
         command, cwd=scratch, env=env, start_new_session=True, **streams
     )

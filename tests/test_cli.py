@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 import flashdex
-from flashdex.cli import main
-from flashdex.doctor import Finding, examine, format_report
+from flashdex.cli.doctor import Finding, examine, format_report
+from flashdex.cli.main import main
 
 ROOT = Path(__file__).parent.parent
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flashdex.cli import make_parser
+from flashdex.cli.main import make_parser
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -176,7 +176,7 @@ def test_data_page_names_exactly_the_frame_entries():
 
 
 def test_data_page_names_exactly_the_codes_of_a_report():
-    from flashdex.viz.library_facts import CODES
+    from flashdex.reports.library.facts import CODES
 
     code = re.compile(r"\b[EIRW]_[A-Z]{2,}\b")
     files = (ROOT / "flashdex/motions").rglob("*.py")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from flashdex import doctor
-from flashdex.cli import main
+from flashdex.cli import doctor
+from flashdex.cli.main import main
 from flashdex.system.machine import Machine
 from flashdex.training import memory
 

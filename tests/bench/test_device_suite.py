@@ -94,7 +94,7 @@ def test_no_time_left_is_written_for_every_job(suite, lines, tmp_path):
 
 @pytest.mark.parametrize("tiny", [True, False])
 def test_every_part_has_commands_that_exist(suite, tmp_path, tiny):
-    from flashdex.cli import make_parser
+    from flashdex.cli.main import make_parser
 
     for part in suite.PARTS:
         choice = suite.Choice("warp", tmp_path, tiny, 9.0, ["seed=1"], tmp_path)

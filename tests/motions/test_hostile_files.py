@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import flashdex
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.datasets import list_recordings
 from flashdex.datasets.fetch import fetch
 from flashdex.datasets.hot3d.files import Track, frame_axis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.training.baselines import Baselines, format_baselines
 
 

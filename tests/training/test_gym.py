@@ -13,7 +13,7 @@ import pytest
 import torch
 from gym_runs import STEPS, TINY, read_metrics, tiny_recipe, trainer_of
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.envs.gym import GymWorlds
 from flashdex.recipe import GymConfig, GymRecipe, compose
 from flashdex.training.evaluator import evaluate_policy, observed

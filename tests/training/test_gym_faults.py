@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gym_runs import read_metrics, tiny_recipe, trainer_of
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.errors import FlashdexError, RunError
 from flashdex.training.checkpoint import newest_checkpoint
 from flashdex.training.evaluator import SEED_OFFSET

@@ -8,7 +8,7 @@ import json
 import pytest
 import torch
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.errors import RunError
 from flashdex.recipe import AlgoConfig, Recipe, dump_recipe
 from flashdex.system.files import run_lock

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.errors import RunError
 from flashdex.replay.disk import ReplayLog
 from flashdex.rollouts.ledger import CONVERSIONS, Ledger

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from pushed_box import make_rollout
 
-from flashdex.cli import main
+from flashdex.cli.main import main
 from flashdex.rollouts.certificate import certify
 
 EVIL = '<script>alert("x")</script> & co'

@@ -11,15 +11,15 @@ import pytest
 import yaml
 from PIL import Image
 
-from flashdex.viz import film
-from flashdex.viz.camera import MARGIN, fit_view, view_axes
-from flashdex.viz.film import NO_GRAPHICS, Film, draw_films, find_backend
-from flashdex.viz.report import write_report
+from flashdex.reports import film
+from flashdex.reports.render.films import NO_GRAPHICS, Film, draw_films, find_backend
+from flashdex.reports.render.rollout import MARGIN, fit_view, view_axes
+from flashdex.reports.run.report import write_report
 
 DRAW = """
 import sys, numpy as np
 from flashdex.rollouts.rollout import Rollout
-from flashdex.viz.frames import Painter
+from flashdex.reports.render.rollout import Painter
 painter = Painter(Rollout.load(sys.argv[1]))
 np.save(sys.argv[2], painter.draw(20))
 """

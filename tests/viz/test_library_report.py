@@ -18,16 +18,16 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
-from flashdex.viz import library_report
-from flashdex.viz.film import NO_GRAPHICS, find_backend
-from flashdex.viz.library_cards import contact_timeline, motion_charts
-from flashdex.viz.library_facts import CODES, RecordingFacts, library_facts
-from flashdex.viz.library_report import (
+from flashdex.reports import library_report
+from flashdex.reports.library.cards import contact_timeline, motion_charts
+from flashdex.reports.library.facts import CODES, RecordingFacts, library_facts
+from flashdex.reports.library.report import (
     histogram,
     summary_lines,
     write_library_report,
 )
-from flashdex.viz.library_thumbs import contact_of, draw_thumbnails, still_frames
+from flashdex.reports.render.films import NO_GRAPHICS, find_backend
+from flashdex.reports.render.stills import contact_of, draw_thumbnails, still_frames
 
 EVIL = '</td><script>alert("x")</script><img src=x onerror=alert(1)> & co'
 EVIL_REASON = "E_DEMO: <b onclick='x'>a/b.npz</b>: \x1b[2J no key"

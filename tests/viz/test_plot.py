@@ -6,7 +6,14 @@ from itertools import pairwise
 
 import pytest
 
-from flashdex.viz.plot import HEIGHT, WIDTH, Series, format_tick, line_chart, nice_ticks
+from flashdex.reports.page import (
+    HEIGHT,
+    WIDTH,
+    Series,
+    format_tick,
+    line_chart,
+    nice_ticks,
+)
 
 
 @pytest.mark.parametrize(

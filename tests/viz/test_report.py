@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from flashdex.errors import RunError
-from flashdex.viz.report import write_report
+from flashdex.reports.run.report import write_report
 
 VOID = {"meta", "img"}
 

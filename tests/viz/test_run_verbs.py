@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from flashdex.cli import _show_run
+from flashdex.cli.main import _show_run
 from flashdex.metrics.criteria import score
 from flashdex.rollouts.rollout import Rollout
 

@@ -3,7 +3,7 @@
 import json
 
 from flashdex.metrics.criteria import score
-from flashdex.viz.table import (
+from flashdex.reports.run.terminal import (
     align,
     evaluation_table,
     run_table,

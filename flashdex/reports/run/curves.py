@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from flashdex.viz.facts import MotionFacts
-from flashdex.viz.html import Html
-from flashdex.viz.plot import Series, line_chart
-from flashdex.viz.run_data import Line, RunData
+from flashdex.reports.page import Html, Series, line_chart
+from flashdex.reports.run.facts import Line, MotionFacts, RunData
 
 SIDES = ("left", "right", "both")
 STEPS = "env steps"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from flashdex.viz.facts import (
+from flashdex.reports.page import NOTHING, Html, joined, number, safe, table, tag
+from flashdex.reports.run.facts import (
     PROVEN,
     SHOWN,
     MotionFacts,
+    RunData,
     criterion_terms,
     in_unit,
 )
-from flashdex.viz.html import NOTHING, Html, joined, number, safe, table, tag
-from flashdex.viz.run_data import RunData
 
 BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
 

@@ -5,13 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from flashdex.errors import RunError
+from flashdex.reports.page import (
+    Html,
+    duration,
+    facts,
+    inline,
+    joined,
+    number,
+    page,
+    tag,
+)
+from flashdex.reports.render.films import Film, draw_films
+from flashdex.reports.run.curves import conversion_charts, learning_charts
+from flashdex.reports.run.facts import (
+    MotionFacts,
+    RunData,
+    count,
+    load_run,
+    motion_facts,
+    num_motions,
+)
+from flashdex.reports.run.motion_table import motion_table, table_notes
 from flashdex.system.files import write_atomic
-from flashdex.viz.curves import conversion_charts, learning_charts
-from flashdex.viz.facts import MotionFacts, count, motion_facts, num_motions
-from flashdex.viz.film import Film, draw_films
-from flashdex.viz.html import Html, duration, facts, inline, joined, number, page, tag
-from flashdex.viz.motion_table import motion_table, table_notes
-from flashdex.viz.run_data import RunData, load_run
 
 REPORT = "report.html"
 GHOST_NOTE = (

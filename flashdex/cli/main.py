@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flashdex.cli_data import Handler, add_data_verbs
+from flashdex.cli.data import Handler, add_data_verbs
 from flashdex.errors import FlashdexError
 
 
@@ -148,7 +148,7 @@ def _add_run_verbs(
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from flashdex.doctor import examine, examine_recipe, format_report
+    from flashdex.cli.doctor import examine, examine_recipe, format_report
 
     if args.recipe is not None:
         report, fits = examine_recipe(args.recipe, args.overrides)
@@ -211,8 +211,8 @@ def _train(args: argparse.Namespace) -> int:
 
 def _show_run(run_dir: Path) -> bool:
     """Show what a run came to; False when a signal ended it, which is no time to."""
+    from flashdex.reports.run.terminal import run_summary
     from flashdex.training.session import SIGNAL, ended_by
-    from flashdex.viz.summary import run_summary
 
     if ended_by(run_dir) == SIGNAL:
         print(f"stopped; go on with: flashdex train --resume {run_dir}")
@@ -229,8 +229,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
         print(json.dumps(evaluate_gym(args.run_dir, args.overrides), indent=1))
         return 0
+    from flashdex.reports.run.terminal import evaluation_table
     from flashdex.training.evaluate import evaluate
-    from flashdex.viz.table import evaluation_table
 
     found = evaluate(args.run_dir, args.overrides)
     print(evaluation_table(found.rows, found.totals))
@@ -239,8 +239,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     from flashdex.recipe import require_motions
+    from flashdex.reports.run.terminal import replay_line
     from flashdex.rollouts.replay import replay
-    from flashdex.viz.table import replay_line
 
     require_motions(args.run_dir)
     replayed = replay(args.run_dir)
@@ -251,8 +251,8 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _score(args: argparse.Namespace) -> int:
     from flashdex.metrics.criteria import score
+    from flashdex.reports.run.terminal import score_table
     from flashdex.rollouts.rollout import Rollout
-    from flashdex.viz.table import score_table
 
     found = {}
     for path in args.files:
@@ -268,7 +268,7 @@ def _score(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace) -> int:
     from flashdex.recipe import require_motions
-    from flashdex.viz.report import write_report
+    from flashdex.reports.run.report import write_report
 
     require_motions(args.run_dir)
     print(write_report(args.run_dir))

@@ -88,7 +88,7 @@ def _fetch(args: argparse.Namespace) -> int:
 
 def _prepare(args: argparse.Namespace) -> int:
     from flashdex.motions.pipeline.prepare import run_order
-    from flashdex.viz.library_report import summary_lines, write_library_report
+    from flashdex.reports.library.report import summary_lines, write_library_report
 
     order = _order(args)
     if args.dry_run:

@@ -1,4 +1,4 @@
-"""Stills of a library: ``python -m flashdex.viz.library_thumbs LIBRARY OUT ROW...``.
+"""Stills of a library: ``python -m flashdex.reports.render.stills LIBRARY OUT ROW...``.
 
 The robot reference is drawn with the objects' visual meshes. As with films, drawing
 happens in a process of its own: graphics that crash take no report with them.
@@ -24,9 +24,14 @@ from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.contact.fingertips import contact_runs
 from flashdex.motions.library import MotionLibrary
-from flashdex.viz import film
-from flashdex.viz.camera import fit_view, view_axes
-from flashdex.viz.frames import AZIMUTHS, ELEVATION, dress_scene
+from flashdex.reports import film
+from flashdex.reports.render.rollout import (
+    AZIMUTHS,
+    ELEVATION,
+    dress_scene,
+    fit_view,
+    view_axes,
+)
 
 WIDTH, HEIGHT = 256, 192  # of one still, pixels
 QUALITY = 80  # of the JPEG
@@ -52,7 +57,7 @@ def draw_thumbnails(
     if backend is None:
         return {}, film.NO_GRAPHICS if rows else ""
     with tempfile.TemporaryDirectory(prefix="flashdex-stills-") as folder:
-        module = "flashdex.viz.library_thumbs"
+        module = "flashdex.reports.render.stills"
         words = ["-m", module, str(library.path.resolve()), folder, *map(str, rows)]
         timeout = 60 + SECONDS_A_MOTION * len(rows)
         fault = film.run_drawer(words, backend, timeout=timeout)

@@ -76,7 +76,7 @@ def draw_films(rollouts: list[Path]) -> str:
         return NO_GRAPHICS
     _LOG.info("drawing %d films", len(todo))
     folder = Film.of(todo[0]).video.parent
-    words = ["-m", "flashdex.viz.frames", *map(str, todo), str(folder)]
+    words = ["-m", "flashdex.reports.render.rollout", *map(str, todo), str(folder)]
     fault = run_drawer(words, backend, timeout=60 + _SECONDS_A_FILM * len(todo))
     missing = [r.stem for r in todo if not Film.of(r).is_newer_than(r)]
     if not missing:

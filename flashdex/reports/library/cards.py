@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from flashdex.datasets.tracks import runs
 from flashdex.keys import FINGERS, SIDES
 from flashdex.motions.library import MotionLibrary
-from flashdex.viz.html import Html, number, tag
-from flashdex.viz.library_facts import RecordingFacts
-from flashdex.viz.library_thumbs import contact_of, frames_of, still_frames
-from flashdex.viz.plot import (
+from flashdex.reports.library.facts import RecordingFacts
+from flashdex.reports.page import (
     BOTTOM,
     COLOURS,
     HEIGHT,
@@ -24,12 +22,16 @@ from flashdex.viz.plot import (
     RIGHT,
     TOP,
     WIDTH,
+    Html,
     Series,
     format_tick,
     line_chart,
     nice_ticks,
+    number,
+    tag,
 )
-from flashdex.viz.table import shorten
+from flashdex.reports.render.stills import contact_of, frames_of, still_frames
+from flashdex.reports.run.terminal import shorten
 
 STATUS_CLASS = {"kept": "good", "flagged": "warn", "rejected": "bad"}
 TIME = "s"

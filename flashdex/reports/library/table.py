@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 
-from flashdex.viz.html import Html, joined, safe, tag
-from flashdex.viz.html import table as plain_table
-from flashdex.viz.library_cards import STATUS_CLASS, card_id
-from flashdex.viz.library_facts import (
+from flashdex.reports.library.cards import STATUS_CLASS, card_id
+from flashdex.reports.library.facts import (
     CODES,
     STATUSES,
     RecordingFacts,
     columns_of,
     count_codes,
 )
-from flashdex.viz.table import shorten
+from flashdex.reports.page import Html, joined, safe, tag
+from flashdex.reports.page import table as plain_table
+from flashdex.reports.run.terminal import shorten
 
 MAX_REASON = 600  # characters; report.csv has all of them
 # Reads what the table shows and writes text only: no name becomes markup.

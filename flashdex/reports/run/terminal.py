@@ -8,17 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.metrics.criteria_table import Verdict
-from flashdex.viz.facts import (
+from flashdex.recipe import task_of_run
+from flashdex.reports.page import duration, number
+from flashdex.reports.run.facts import (
     SHOWN,
     MotionFacts,
+    RunData,
     count,
     criterion_terms,
     in_unit,
+    load_run,
     motion_facts,
     num_motions,
 )
-from flashdex.viz.html import duration, number
-from flashdex.viz.run_data import RunData, load_run
+from flashdex.reports.run.report import write_report
 
 MAX_WIDTH = 100
 NAME_WIDTH = 20
@@ -243,3 +246,42 @@ def shorten(text: str, width: int) -> str:
         width: characters it may have.
     """
     return text if len(text) <= width else f"{text[: width - 2]}.."
+
+
+ROWS = 12  # newest evaluations shown
+
+
+def gym_run_table(run_dir: str | Path) -> str:
+    """Return of the deterministic policy over env steps, newest last.
+
+    Args:
+        run_dir: run directory.
+    """
+    run = load_run(run_dir)
+    env_id = run.recipe.get("gym", {}).get("env_id", "?")
+    head = (
+        f"{run.recipe.get('name', run.path.name)}  {env_id}  "
+        f"seed {run.recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
+        f"{duration(run.wall_s)}"
+    )
+    found = [record for record in run.metrics if "eval/return" in record]
+    if not found:
+        return f"{head}\nnot evaluated yet; records: {run.path / 'metrics.jsonl'}"
+    lines = [f"{'env steps':>12} {'return':>9} {'std':>8} {'length':>7}"]
+    lines += [
+        f"{int(r['env_steps']):>12,} {r['eval/return']:>9.1f} "
+        f"{r['eval/return_std']:>8.1f} {r['eval/length']:>7.0f}"
+        for r in found[-ROWS:]
+    ]
+    return "\n".join([head, "", *lines, "", f"records: {run.path / 'metrics.jsonl'}"])
+
+
+def run_summary(run_dir: Path) -> str:
+    """Table of a run; of one with motions, the report is written as well.
+
+    Args:
+        run_dir: run directory.
+    """
+    if task_of_run(run_dir) == "gym":
+        return gym_run_table(run_dir)
+    return f"{run_table(run_dir)}\n\nreport: {write_report(run_dir)}"

@@ -1,0 +1,1 @@
+"""Pictures and films, drawn in a process of their own."""

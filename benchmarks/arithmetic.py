@@ -13,8 +13,8 @@ import argparse
 import json
 from dataclasses import replace
 
-from flashdex.bench.learner_sizes import SIZES, make_batch, make_loss
-from flashdex.bench.products import count_products, total_flops
+from benchmarks.common.ceilings import count_products, total_flops
+from benchmarks.learner import SIZES, make_batch, make_loss
 from flashdex.objectives.stepper import FlashSACStepper
 
 COUNTED = (64, 128)  # rows of the counted updates

@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 
-from flashdex.bench.library import bench_library
-from flashdex.bench.output import add_output_options, emit
-from flashdex.bench.turns import TurnTaker
+from benchmarks.common.library import bench_library
+from benchmarks.common.output import add_output_options, emit
+from benchmarks.common.turns import TurnTaker
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
 from flashdex.training.build import open_workbench

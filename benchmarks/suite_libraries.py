@@ -18,7 +18,7 @@ from pathlib import Path
 
 from suite_parts import CURVE_LIBRARY
 
-from flashdex.bench.library import bench_library
+from benchmarks.common.library import bench_library
 from flashdex.motions.pipeline.prepare import prepare
 
 SCENES = ((2, 16), (2, 1), (2, 4), (2, 8), (1, 16), (1, 1))

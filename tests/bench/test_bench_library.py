@@ -7,8 +7,12 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull
 
-from flashdex.bench.hulls import cut_hull
-from flashdex.bench.library import bench_library, describe_scene, recut_library
+from benchmarks.common.library import (
+    bench_library,
+    cut_hull,
+    describe_scene,
+    recut_library,
+)
 from flashdex.errors import FlashdexError
 from flashdex.motions.library import FRAME_KEYS
 

@@ -7,8 +7,8 @@ import json
 import pytest
 import torch
 
-from flashdex.bench import duel
-from flashdex.bench import env as bench
+from benchmarks import env as bench
+from benchmarks.common import duel
 
 
 def test_bare_physics_follows_the_environment_bit_for_bit(make_env):

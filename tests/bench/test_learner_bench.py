@@ -7,14 +7,14 @@ import json
 import pytest
 import torch
 
-from flashdex.bench import learner as bench
-from flashdex.bench.learner_sizes import LearnerSize, make_batch, make_loss, make_plain
-from flashdex.bench.products import (
+from benchmarks import learner as bench
+from benchmarks.common.ceilings import (
     Product,
     count_products,
     replay_seconds,
     total_flops,
 )
+from benchmarks.learner import LearnerSize, make_batch, make_loss, make_plain
 from flashdex.modules.product import multiply
 from flashdex.objectives.stepper import FlashSACStepper
 

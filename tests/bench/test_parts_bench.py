@@ -7,8 +7,9 @@ import json
 import pytest
 import torch
 
-from flashdex.bench import clock, replay, train, turns
-from flashdex.bench.ceilings import gather_seconds, matmul_ceilings
+from benchmarks import replay, train
+from benchmarks.common import clock, turns
+from benchmarks.common.ceilings import gather_seconds, matmul_ceilings
 from flashdex.errors import FlashdexError
 
 CPU = torch.device("cpu")

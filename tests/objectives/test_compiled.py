@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from flashdex.bench.learner_sizes import LearnerSize, make_batch, make_loss
+from benchmarks.learner import LearnerSize, make_batch, make_loss
 from flashdex.modules import product
 from flashdex.objectives.stepper import FlashSACStepper
 

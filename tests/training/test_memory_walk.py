@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from benchmarks.common.ceilings import count_products, total_flops
 from flashdex.algorithms.agent import make_actor, make_critic
-from flashdex.bench.products import count_products, total_flops
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.recipe import AlgoConfig
 from flashdex.training.memory_walk import (

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.common.clock import now
 from flashdex import keys
-from flashdex.bench.clock import now
 from flashdex.envs.tracking import TrackingEnv
 
 TURN = 32  # control steps, half a second of simulated time

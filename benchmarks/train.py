@@ -16,10 +16,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from flashdex.bench.clock import memory_gb, now, reset_peak_memory
-from flashdex.bench.env import add_recipe_options, compose_bench, describe_bench
-from flashdex.bench.output import emit
-from flashdex.bench.turns import physics_rate, room_used
+from benchmarks.common.clock import memory_gb, now, reset_peak_memory
+from benchmarks.common.output import emit
+from benchmarks.common.turns import physics_rate, room_used
+from benchmarks.env import add_recipe_options, compose_bench, describe_bench
 from flashdex.recipe import Recipe
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.training.assemble import BASELINES, make_trainer

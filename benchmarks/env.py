@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from flashdex.bench import duel, turns
-from flashdex.bench.clock import memory_gb
-from flashdex.bench.library import bench_library, describe_scene
-from flashdex.bench.output import add_output_options, emit
+from benchmarks.common import duel, turns
+from benchmarks.common.clock import memory_gb
+from benchmarks.common.library import bench_library, describe_scene
+from benchmarks.common.output import add_output_options, emit
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from benchmarks.common.ceilings import copy_gb_per_s, gather_seconds
+from benchmarks.common.clock import free_memory, memory_gb, now, seconds_each
+from benchmarks.common.library import describe_scene
+from benchmarks.common.output import emit
+from benchmarks.env import add_recipe_options, compose_bench
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
-from flashdex.bench.ceilings import copy_gb_per_s, gather_seconds
-from flashdex.bench.clock import free_memory, memory_gb, now, seconds_each
-from flashdex.bench.env import add_recipe_options, compose_bench
-from flashdex.bench.library import describe_scene
-from flashdex.bench.output import emit
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe

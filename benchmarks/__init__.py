@@ -1,0 +1,1 @@
+"""Everything that measures; each file is a command: python -m benchmarks.NAME."""

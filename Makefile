@@ -60,9 +60,9 @@ check: $(DEV)
 	$(BIN)/python docs/check_links.py
 
 bench: $(DEV)
-	$(BIN)/flashdex bench env --num-envs 64
-	$(BIN)/flashdex bench env --num-envs 512
-	$(BIN)/flashdex bench learner
+	$(BIN)/python -m benchmarks.env --num-envs 64
+	$(BIN)/python -m benchmarks.env --num-envs 512
+	$(BIN)/python -m benchmarks.learner
 	$(BIN)/python -m pytest -m "learn or slow"
 
 docs: $(CORE)

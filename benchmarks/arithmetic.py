@@ -1,6 +1,6 @@
 """What an update costs by counting: products, parameters, bytes. No speed is measured.
 
-    python benchmarks/arithmetic.py
+    python -m benchmarks.arithmetic
 
 Products are counted on the library's own update at a small batch and scaled: they grow
 with the batch in proportion, which the second count checks. Ceilings are the counts
@@ -18,7 +18,7 @@ from benchmarks.learner import SIZES, make_batch, make_loss
 from flashdex.objectives.stepper import FlashSACStepper
 
 COUNTED = (64, 128)  # rows of the counted updates
-ROW_BYTES = 990  # two XHands, two objects: `flashdex bench replay`
+ROW_BYTES = 990  # two XHands, two objects: `python -m benchmarks.replay`
 
 
 def flop_of(batch: int) -> float:

@@ -1,7 +1,7 @@
 """Choose the motions of a benchmark by a rule, from a library and its baselines.
 
     flashdex baselines real_cpu motions.library=libraries/myodm --out scores.json
-    python benchmarks/choose_motions.py libraries/myodm scores.json --count 50
+    python -m benchmarks.choose_motions libraries/myodm scores.json --count 50
 
 The rule: a motion is eligible when neither an object that never moves (frozen_object)
 nor a hand that holds still (do_nothing) passes it by any criterion. Of the eligible

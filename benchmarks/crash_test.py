@@ -1,6 +1,6 @@
 """Kill a training run again and again, resume it each time, and check what is left.
 
-    python benchmarks/crash_test.py --kills 20 --out benchmarks/results/crash_test.json
+    python -m benchmarks.crash_test --kills 20 --out benchmarks/results/crash_test.json
 
 A small variant of the quickstart, on three motions of less than a second, runs as a
 process of its own and gets SIGKILL at a random moment of its start or its training,

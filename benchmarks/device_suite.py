@@ -1,6 +1,6 @@
 """Runs one part of the measurements on a GPU machine, unattended and within minutes.
 
-    python benchmarks/device_suite.py --part env --minutes 9 --out env.jsonl \
+    python -m benchmarks.device_suite --part env --minutes 9 --out env.jsonl \
         --libraries suite.tar.xz
 
 Each configuration is a process of its own with a time limit, most important first. Its
@@ -23,10 +23,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from suite_parts import PARTS, Choice, Job, jobs_of
+from benchmarks.suite_parts import PARTS, Choice, Job, jobs_of
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
 MESSAGE_LINES = 20
 LEAST_S = 20.0  # less time than this is not worth a start
 POLL_S = 0.5
@@ -146,17 +145,17 @@ def _write_curve(job: Job, lines: Lines, watched: Watched) -> None:
 
 
 def start(words: list[str], scratch: Path, **streams: Any) -> subprocess.Popen[bytes]:
-    """Begin a command of flashdex in a process group of its own.
+    """Begin a command in a process group of its own.
 
     Args:
-        words: after `flashdex`.
+        words: after `python -m`.
         scratch: working folder.
         streams: of the process.
     """
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path.rstrip(os.pathsep)}
     env |= {"WANDB_MODE": "offline", "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-m", "flashdex.cli.main", *words]
+    command = [sys.executable, "-m", *words]
     return subprocess.Popen(
         command, cwd=scratch, env=env, start_new_session=True, **streams
     )
@@ -224,7 +223,7 @@ def main() -> None:
         )
     signal.signal(signal.SIGTERM, _interrupted)
     with tempfile.TemporaryDirectory(prefix="flashdex-suite-") as folder:
-        from suite_libraries import unpack
+        from benchmarks.suite_libraries import unpack
 
         scratch = Path(folder)
         choice = Choice(

@@ -1,4 +1,4 @@
-"""``flashdex bench env``: the tracking environment against its physics alone."""
+"""``python -m benchmarks.env``: the tracking environment against its physics alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
         The printed object.
     """
     args = _parse(words or [])
-    recipe = compose_bench(args, where="bench env")
+    recipe = compose_bench(args, where="benchmarks.env")
     bench = open_workbench(recipe)
     begin = time.perf_counter()
     env = bench.make_env()
@@ -122,7 +122,7 @@ def compose_bench(
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="flashdex bench env")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.env")
     add_recipe_options(parser, recipe="quickstart")
     parser.add_argument("--seconds", type=float, default=10.0, help="how long")
     return parser.parse_intermixed_args(words)

@@ -1,6 +1,6 @@
 """How the cost of a world's step grows with hulls, objects and worlds, as ratios.
 
-    OMP_NUM_THREADS=1 python benchmarks/env_growth.py --out lines.jsonl
+    OMP_NUM_THREADS=1 python -m benchmarks.env_growth --out lines.jsonl
 
 All sizes stand side by side in one process and take turns, so that other work on the
 machine slows them alike: each figure is a median of ratios to the first size, which

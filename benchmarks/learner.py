@@ -1,4 +1,4 @@
-"""``flashdex bench learner``: the FlashSAC update against its plainest form.
+"""``python -m benchmarks.learner``: the FlashSAC update against its plainest form.
 
 Both hold the same weights and see the same batch and noise; they take turns in one
 process, so that what else runs on the machine slows both alike. An actor step comes
@@ -456,7 +456,7 @@ def _device(name: str) -> torch.device:
     is_there = torch.cuda.is_available()
     if name == "cuda" and not is_there:
         raise FlashdexError(
-            "bench learner: --device cuda, but torch sees no GPU ('flashdex doctor' "
+            "benchmarks.learner: --device cuda, but torch sees no GPU ('flashdex doctor' "
             "says why). Use --device cpu or auto."
         )
     return torch.device("cuda" if is_there and name != "cpu" else "cpu")
@@ -497,7 +497,7 @@ def _one_size(
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="flashdex bench learner")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.learner")
     parser.add_argument(
         "--sizes",
         nargs="+",

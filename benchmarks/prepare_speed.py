@@ -1,6 +1,6 @@
 """Seconds a recording of `flashdex prepare`, and what a second worker gains.
 
-    OMP_NUM_THREADS=1 python benchmarks/prepare_speed.py --limit 12
+    OMP_NUM_THREADS=1 python -m benchmarks.prepare_speed --limit 12
 
 Each number of workers starts with an empty cache, so meshes are decomposed; the last
 run repeats the first one from its cache. Prints one JSON line. Needs `flashdex fetch

@@ -1,7 +1,7 @@
 """Render tables of docs/benchmarks.md from the JSON lines in benchmarks/results.
 
-    python benchmarks/render_table.py benchmarks/results/h200_*.jsonl
-    python benchmarks/render_table.py FILE ... --into docs/benchmarks.md --name h200
+    python -m benchmarks.render_table benchmarks/results/h200_*.jsonl
+    python -m benchmarks.render_table FILE ... --into docs/benchmarks.md --name h200
 
 Every number stands in a line of a file; nothing is typed by hand. With `--into` the
 text between `<!-- table NAME -->` and `<!-- end -->` is replaced.

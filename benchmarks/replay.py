@@ -1,4 +1,4 @@
-"""``flashdex bench replay``: rows written and sampled a second, and bytes a row.
+"""``python -m benchmarks.replay``: rows written and sampled a second, and bytes a row.
 
 The ring is filled to the last row with rows of a real environment. The ceiling is one
 wide table of the same bytes, gathered at as many random rows.
@@ -54,7 +54,7 @@ def main(words: list[str] | None = None) -> list[dict[str, Any]]:
             changes.append(f"algo.replay={args.replay}")
         if args.batch is not None:
             changes.append(f"algo.batch_size={args.batch}")
-        recipe = compose_bench(args, where="bench replay", changes=tuple(changes))
+        recipe = compose_bench(args, where="benchmarks.replay", changes=tuple(changes))
         results.append(emit(measure(recipe, seconds=args.seconds), out=args.out))
         gc.collect()
     return results
@@ -140,13 +140,13 @@ _HOST = torch.device("cpu")
 def _refuse(rows: int, width: int, kept_on: torch.device) -> None:
     if rows < PUSH:
         raise FlashdexError(
-            f"bench replay: --rows {rows} is less than the {PUSH} that are written at "
+            f"benchmarks.replay: --rows {rows} is less than the {PUSH} that are written at "
             "once. Ask for more."
         )
     needed, free = rows * width, free_memory(kept_on)
     if needed > SPARE * free:
         raise FlashdexError(
-            f"bench replay: {rows} rows of {width} bytes are {needed / 1e9:.1f} GB, "
+            f"benchmarks.replay: {rows} rows of {width} bytes are {needed / 1e9:.1f} GB, "
             f"and {kept_on} has {free / 1e9:.1f} GB free, of which {SPARE:.0%} may be "
             "taken. Ask for fewer --rows, or on a GPU for --replay pinned."
         )
@@ -228,7 +228,7 @@ def count_of(text: str) -> int:
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="flashdex bench replay")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.replay")
     add_recipe_options(parser, recipe="quickstart")
     parser.set_defaults(objects=2)
     parser.add_argument(

@@ -1,7 +1,7 @@
 """Prepares what the device suite needs, once, on any computer; no GPU is used.
 
-    python benchmarks/suite_libraries.py libraries/suite --workers 2
-    python benchmarks/suite_libraries.py libraries/suite --pack suite.tar.xz
+    python -m benchmarks.suite_libraries libraries/suite --workers 2
+    python -m benchmarks.suite_libraries libraries/suite --pack suite.tar.xz
 
 The suite then needs no network, no CoACD and no retargeting: it takes the folder, or
 the archive, which is a fifth of its size.
@@ -16,9 +16,8 @@ import tarfile
 import time
 from pathlib import Path
 
-from suite_parts import CURVE_LIBRARY
-
 from benchmarks.common.library import bench_library
+from benchmarks.suite_parts import CURVE_LIBRARY
 from flashdex.motions.pipeline.prepare import prepare
 
 SCENES = ((2, 16), (2, 1), (2, 4), (2, 8), (1, 16), (1, 1))

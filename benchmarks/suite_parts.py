@@ -13,11 +13,11 @@ FEW_WORLDS = "env.attempt_share=0.5"  # of a handful there must be one
 
 @dataclass(frozen=True)
 class Job:
-    """One command of `flashdex`.
+    """One command: a module and its words.
 
     Attributes:
         name: in the lines of results.
-        words: after `flashdex`.
+        words: after `python -m`.
         limit_s: it is stopped after that many seconds.
         watch: file of JSON lines that grows while it runs, or None.
     """
@@ -84,7 +84,7 @@ def _env(choice: Choice) -> list[Job]:
     return [
         Job(
             f"env o{objects} h{hulls} n{n}",
-            ["bench", "env", *_scene(choice, objects, hulls, n), *times, *changes],
+            ["benchmarks.env", *_scene(choice, objects, hulls, n), *times, *changes],
             limit_s=180,
         )
         for objects, hulls, n in sizes
@@ -103,7 +103,7 @@ def _train(choice: Choice) -> list[Job]:
     return [
         Job(
             f"train n{n}",
-            ["bench", "train", *_scene(choice, 2, 16, n), *times, *changes],
+            ["benchmarks.train", *_scene(choice, 2, 16, n), *times, *changes],
             limit_s=300,
         )
         for n in ((8,) if choice.tiny else (4096, 8192, 2048))
@@ -111,7 +111,7 @@ def _train(choice: Choice) -> list[Job]:
 
 
 def _learner(choice: Choice) -> list[Job]:
-    words = ["bench", "learner", "--sizes", "tiny" if choice.tiny else "paper"]
+    words = ["benchmarks.learner", "--sizes", "tiny" if choice.tiny else "paper"]
     words += ["--device", "auto"]
     rounds = ["--rounds", "2" if choice.tiny else "10"]
     fast = [*words, *rounds, "--precision", "high", "--autocast"]
@@ -127,7 +127,7 @@ def _replay(choice: Choice) -> list[Job]:
     if not choice.tiny:
         sizes = [("device", "50M"), ("pinned", "50M"), ("device", "1M")]
         sizes += [("device", "10M"), ("pinned", "10M"), ("cpu", "1M")]
-    words = ["bench", "replay", *_scene(choice, 2, 1, None)]
+    words = ["benchmarks.replay", *_scene(choice, 2, 1, None)]
     if choice.tiny:
         words += ["--batch", "64", "--seconds", "0.2", "algo.compile=false"]
     words += ["env.compile=false"]  # its rows are what is wanted of the environment
@@ -147,6 +147,7 @@ def _curve(choice: Choice) -> list[Job]:
     # the rest of the call is for building the scenes and the last checkpoint
     limit = max(0.5, choice.minutes - (0.2 if choice.tiny else 1.5)) * 60
     words = [
+        "flashdex.cli.main",
         "train",
         RECIPE,
         f"motions.library={choice.libraries / CURVE_LIBRARY}",

@@ -1,6 +1,6 @@
 """Print what a training run achieved, as the JSON kept in benchmarks/results.
 
-Usage: python benchmarks/summarise_run.py RUN --command "make quickstart" --note "..."
+Usage: python -m benchmarks.summarise_run RUN --command "make quickstart" --note "..."
 """
 
 from __future__ import annotations

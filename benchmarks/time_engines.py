@@ -1,6 +1,6 @@
 """Time engines on one hand and one box: first step (compilation included) and later.
 
-Prints one JSON line an engine. ``python benchmarks/time_engines.py cpu brax``.
+Prints one JSON line an engine. ``python -m benchmarks.time_engines cpu brax``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "envs")]
 
 from reduced import reduced_library  # noqa: E402  # pyright: ignore[reportMissingImports]
 
+from flashdex.envs.physics.config import PhysicsConfig  # noqa: E402
 from flashdex.envs.physics.make import make_physics  # noqa: E402
 from flashdex.envs.reference import ReferenceBank  # noqa: E402
 from flashdex.hands.spec import load_hand  # noqa: E402
-from flashdex.recipe import PhysicsConfig  # noqa: E402
 
 
 def time_engine(engine: str, num_envs: int, steps: int) -> dict[str, float | str]:

@@ -1,4 +1,4 @@
-"""``flashdex bench train``: the whole training loop, and its parts alone.
+"""``python -m benchmarks.train``: the whole training loop, and its parts alone.
 
 Physics alone and updates alone are measured in the same process before and after the
 loop, so that the loop's figures are shares of what was possible at that moment.
@@ -60,11 +60,11 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
 def _compose(args: argparse.Namespace) -> Recipe:
     """The recipe, learning from the first few batches of rows on."""
     first = compose_bench(
-        args, where="bench train", changes=(*CHANGES, "algo.min_buffer=1")
+        args, where="benchmarks.train", changes=(*CHANGES, "algo.min_buffer=1")
     )
     rows = max(2 * first.algo.batch_size, 4 * first.env.num_envs)
     least = f"algo.min_buffer={min(rows, first.algo.buffer_size)}"
-    return compose_bench(args, where="bench train", changes=(*CHANGES, least))
+    return compose_bench(args, where="benchmarks.train", changes=(*CHANGES, least))
 
 
 def measure(
@@ -202,7 +202,7 @@ def _loop(trainer: Trainer, td: TensorDictBase, *, seconds: float) -> dict[str, 
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="flashdex bench train")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.train")
     add_recipe_options(parser, recipe="quickstart")
     parser.add_argument("--seconds", type=float, default=20.0, help="of the loop")
     parser.add_argument(

@@ -11,9 +11,10 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from flashdex.envs.config import EnvConfig, GymConfig
 from flashdex.envs.mdp.options import REGISTRY, NoOptions
 from flashdex.envs.transforms import blocks
-from flashdex.recipe import EnvConfig, GymConfig, GymRecipe, LoopConfig, Recipe
+from flashdex.recipe import GymRecipe, LoopConfig, Recipe
 from flashdex.recipe.schema import Expectation, RunRecipe
 
 PAGE = Path(__file__).parent / "options.md"

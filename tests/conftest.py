@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+pytest_plugins = ["fixture_recordings", "fixture_runs"]
+
 # Heavy imports stand inside the fixtures: tests that need none of them stay fast.
 
 
@@ -34,8 +36,8 @@ def bank(library, hands):
 @pytest.fixture(scope="session")
 def make_physics(library, hands):
     """Build the cpu engine: worlds, then fields of PhysicsConfig."""
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.cpu import CpuPhysics
-    from flashdex.recipe import PhysicsConfig
 
     def make(num_envs, **fields):
         config = PhysicsConfig(**{"num_threads": 1, **fields})
@@ -47,8 +49,8 @@ def make_physics(library, hands):
 @pytest.fixture(scope="session")
 def make_env(make_physics, bank, hands):
     """Build a tracking env: worlds, seed, evaluation, then fields of EnvConfig."""
+    from flashdex.envs.config import EnvConfig
     from flashdex.envs.tracking import TrackingEnv
-    from flashdex.recipe import EnvConfig
 
     def make(num_envs=4, *, seed=0, evaluation=False, physics=None, **fields):
         engine = make_physics(num_envs, **(physics or {}))

@@ -57,7 +57,8 @@ def first_cells(page, heading):
 def run_tiny(library, tmp_path_factory):
     """Train for a few steps into a folder of its own; return the folder."""
     from flashdex.algorithms.config import AlgoConfig, PPOConfig
-    from flashdex.envs.config import AssistConfig, EnvConfig
+    from flashdex.envs.config import EnvConfig
+    from flashdex.envs.mdp.assist import AssistConfig
     from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.recipe import Recipe, validate
     from flashdex.recipe.motions import MotionsConfig

@@ -34,7 +34,7 @@ def measure_recipe(
         itself, ``whole`` everything; and the widths it was measured at.
     """
     changed = ["algo.actor_delay=0", *overrides]
-    recipe = expect_kind(compose(name, changed), Recipe, where="bench learner")
+    recipe = expect_kind(compose(name, changed), Recipe, where="benchmarks.learner")
     bench = open_workbench(recipe)
     env = bench.make_env()
     learner = bench.make_learner(env)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.exploration import NoiseRepetition
@@ -18,7 +19,6 @@ from flashdex.modules.product import tf32_products
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.objectives.stepper import FlashSACStepper
-from flashdex.recipe import AlgoConfig
 
 
 class FlashSACAgent:

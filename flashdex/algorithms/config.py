@@ -1,4 +1,4 @@
-"""TODO docstring."""
+"""Configuration of the algorithms: FlashSAC, and PPO where it differs."""
 
 from __future__ import annotations
 

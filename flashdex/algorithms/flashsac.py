@@ -14,12 +14,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flashdex import keys
 from flashdex.algorithms.agent import FlashSACAgent
 from flashdex.algorithms.base import snapshot
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.compiled import Assembly
 from flashdex.modules.layers import restore_generator
-from flashdex.recipe import AlgoConfig
-from flashdex.replay.buffer import make_buffer
+from flashdex.replay.buffer import STAGES, HostBuffer, RowBuffer, check_pinning
 from flashdex.replay.codec import RowCodec, RowPatch, finite_rows
 from flashdex.replay.nstep import NStepAssembler
 
@@ -410,3 +410,36 @@ class GymLearner(ReplayLearner):
     def update(self) -> TensorDict:
         """One FlashSAC update on a fresh sample; returns its metrics."""
         return self.agent.update(self.sample())
+
+
+def make_buffer(
+    config: AlgoConfig, *, device: torch.device, generator: torch.Generator, seed: int
+) -> RowBuffer:
+    """The replay buffer of a recipe.
+
+    Args:
+        config: algorithm part of the recipe.
+        device: of the learner.
+        generator: of the learner, on its device; it draws the samples as long as they
+            are drawn there, one after the other.
+        seed: of another one otherwise.
+
+    Raises:
+        FlashdexError: pinned memory without a CUDA device, or it cannot be had.
+    """
+    sizes = {"batch_size": config.batch_size, "device": device}
+    if config.replay in ("auto", "device"):
+        return RowBuffer(config.buffer_size, generator=generator, **sizes)
+    pinned = config.replay == "pinned"
+    if pinned:
+        check_pinning(device)
+    if device.type != "cpu" or config.prefetch:
+        generator = torch.Generator().manual_seed(seed)
+    return HostBuffer(
+        config.buffer_size,
+        generator=generator,
+        prefetch=config.prefetch,
+        stages=STAGES if pinned else 0,
+        pinned=pinned,
+        **sizes,
+    )

@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Transform
 
 from flashdex import keys
 from flashdex.algorithms.agent import make_encoder
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.transforms.compiled import Assembly
@@ -20,7 +21,6 @@ from flashdex.modules.gaussian_policy import GaussianPolicy, RunningNorm, ValueN
 from flashdex.modules.layers import restore_generator
 from flashdex.objectives.ppo import PPO, bootstrap_rows
 from flashdex.objectives.reward_normalizer import RewardNormalizer
-from flashdex.recipe import AlgoConfig
 
 CHUNK = 4096  # rows assembled at once
 

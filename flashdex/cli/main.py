@@ -138,14 +138,6 @@ def _add_run_verbs(
     verb = add("report", _report, "write report.html of a run again")
     verb.add_argument("run_dir", type=Path, metavar="RUN")
 
-    verb = add("bench", _bench, "measure; prints JSON")
-    verb.add_argument(
-        "what", choices=["env", "replay", "learner", "train"], help="what to measure"
-    )
-    verb.add_argument(
-        "words", nargs=argparse.REMAINDER, help="options of it; try: bench env --help"
-    )
-
 
 def _doctor(args: argparse.Namespace) -> int:
     from flashdex.cli.doctor import examine, examine_recipe, format_report
@@ -273,14 +265,3 @@ def _report(args: argparse.Namespace) -> int:
     require_motions(args.run_dir)
     print(write_report(args.run_dir))
     return 0
-
-
-def _bench(args: argparse.Namespace) -> int:
-    from importlib import import_module
-
-    import_module(f"flashdex.bench.{args.what}").main(args.words)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -24,7 +24,7 @@ from flashdex.datasets.body_models.mano import (
     mano_pair,
     rotations_from_axis_angle,
 )
-from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.demo import MAX_SECONDS, DemoObject, HumanDemo
 from flashdex.datasets.fields import part, pose_track, same_length, to_array, track
 from flashdex.datasets.pickles import load_object_array
 from flashdex.datasets.roots import refuse_clone, relative, require_folders, scaled_mesh
@@ -32,7 +32,6 @@ from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import missing_frames, palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.checks.recording import MAX_SECONDS
 
 FPS = 30.0
 SEQUENCES, TEMPLATES = "raw_seqs", "meta/object_vtemplates"

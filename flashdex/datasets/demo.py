@@ -205,3 +205,10 @@ class HumanDemo:
             needs_cutting=False,
             provenance=self.provenance | {"frames": [first + start, first + end]},
         )
+
+
+# turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
+UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
+
+
+MIN_SECONDS, MAX_SECONDS = 1.0, 20.0

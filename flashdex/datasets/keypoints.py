@@ -20,10 +20,10 @@ from flashdex.datasets.fields import number, numbers
 from flashdex.datasets.pickles import load_arrays
 from flashdex.datasets.roots import refuse_pointer
 from flashdex.datasets.source import Recording, Source, SourceOptions
+from flashdex.datasets.support import demo_support
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.align import demo_support
 
 KEYS = (
     *("fps", "object", "obj_pose"),

@@ -1,4 +1,4 @@
-"""TODO docstring."""
+"""Configuration of the environments: the tracking env and stock Gymnasium ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from flashdex.envs.mdp.assist import AssistConfig
 from flashdex.envs.mdp.options import default_mapping
+from flashdex.envs.mdp.resets import ResetNoise
 from flashdex.system.fields import number
 
 
@@ -20,78 +22,6 @@ def _default_rewards() -> dict[str, dict[str, Any] | None]:
 
 def _default_terminations() -> dict[str, dict[str, Any] | None]:
     return default_mapping("terminations")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResetNoise:
-    """Standard deviations of the start state around the reference."""
-
-    wrist_pos: float = number(0.001, low=0)
-    """Wrist position, m."""
-    wrist_rot_deg: float = number(1.0, low=0)
-    """Wrist orientation, degrees."""
-    finger_range: float = number(0.0125, low=0)
-    """Finger joints, share of the joint range."""
-    wrist_vel: float = number(0.001, low=0)
-    """Added to the wrist velocity, m/s and rad/s."""
-    finger_vel: float = number(0.01, low=0)
-    """Replaces the finger velocity, rad/s."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AssistConfig:
-    """PD wrench on the objects that fades while the policy learns.
-
-    F = kp (x_ref - x) + kv (v_ref - v);
-    tau = I_w [ratio kp rotvec(R_ref R^T) + sqrt(ratio) kv (w_ref - w)].
-    An epoch is `epoch_steps` control steps of all worlds.
-    """
-
-    enabled: bool = False
-    """Off by default; the released code has it on for 63 % of training."""
-    kp: float = number(80.0, low=0)
-    """Stiffness at the start, N/m."""
-    kv: float = number(5.0, low=0)
-    """Damping at the start, N s/m."""
-    torque_ratio: float = number(96.0, low=0)
-    """Angular over linear stiffness; its square root for the damping."""
-    force_limit: float = number(50.0, low=0)
-    """Clamp of each force component, N."""
-    torque_limit: float = number(50.0, low=0)
-    """Clamp of each torque component, N m."""
-    epoch_steps: int = number(32, low=1)
-    """Control steps an epoch."""
-    window_epochs: int = number(30, low=1)
-    """Epochs over which the gates are averaged; cleared at each decay."""
-    wait_epochs: int = number(100, low=0)
-    """Epochs before the first decay."""
-    cooldown_epochs: int = number(40, low=0)
-    """Epochs between two decays; shorter frees the object sooner."""
-    decay: float = number(0.9, above=0, high=1)
-    """Factor of the upper gain at each decay."""
-    lower_ratio: float = number(0.8, low=0, high=1)
-    """Lower end of the per-world draw over the upper one, after a decay."""
-    zero_below: float = number(0.05, low=0)
-    """All gains become zero once the upper kp is below this."""
-    lower_zero_below: float = number(0.1, low=0)
-    """The lower end becomes zero once it is below this."""
-    task_gate: float = number(0.6, low=0, high=1)
-    """Weighted object term, summed over hands, that a decay demands."""
-    imitation_gate: float = number(0.01, low=0)
-    """Imitation reward that a decay demands."""
-    bc_gate: float = number(0.01, low=0)
-    """Behaviour-cloning reward that a decay demands."""
-    completion_gate: float = number(0.65, low=0, high=1)
-    """Share of episodes without failure that a decay demands."""
-    dial_back: bool = False
-    """Return one gain level when completion falls; evaluated before the gates. The
-    released code has the rule in an order that never acts."""
-    dial_back_completion: float = number(0.5, low=0, high=1)
-    """Completion below which a level is returned."""
-    dial_back_epochs: int = number(500, low=0)
-    """Epochs since the last decay before a level may be returned."""
-    dial_back_factor: float = number(0.98, above=0, high=1)
-    """Factor on the returned level."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flashdex.envs.config import GymConfig
 from flashdex.errors import FlashdexError, MissingExtraError
-from flashdex.recipe import GymConfig
 
 
 @dataclass(frozen=True)

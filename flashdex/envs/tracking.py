@@ -13,8 +13,9 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from flashdex import keys
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
-from flashdex.envs.mdp.assist import AssistSchedule
+from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
 from flashdex.envs.mdp.managers import Judge, Outcome, Scoring, StepInfo
 from flashdex.envs.mdp.resets import ResetDraw, draw_reset, reset_state
 from flashdex.envs.mdp.samplers import SAMPLERS, UnconvertedSampler
@@ -24,7 +25,6 @@ from flashdex.envs.scene.wrench import ObjectWrench, hold_share
 from flashdex.envs.transforms.contact_code import CODE_WIDTH, contact_code
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.recipe import AssistConfig, EnvConfig
 
 # Below this many worlds a thread, waking the threads costs more than they save; beside
 # the physics engine's own threads a barrier can even wait for the scheduler.

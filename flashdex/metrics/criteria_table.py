@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from flashdex.errors import UnknownNameError
 from flashdex.keys import SIDES, Side
@@ -224,3 +224,21 @@ class Verdict:
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return asdict(self)
+
+
+CriterionName = Literal[
+    "sr_mt_obj",
+    "sr_mt",
+    "sr_mt_obj_x0.5",
+    "sr_mt_obj_x2",
+    "sr_mt_x0.5",
+    "sr_mt_x2",
+    "sr_loose",
+    "sr_mt_obj_frame",
+    "sr_mt_frame",
+    "sr_mt_obj_p95",
+    "sr_spider_centred",
+    "sr_spider_raw",
+    "sr_spider_worst",
+]
+CRITERIA: tuple[str, ...] = get_args(CriterionName)

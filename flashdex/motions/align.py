@@ -8,13 +8,12 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.demo import UP_ROTATION, HumanDemo
+from flashdex.datasets.support import estimate_support
 from flashdex.datasets.tracks import (
     continuous,
-    missing_frames,
     resample,
     resample_pose,
-    runs,
     sample_times,
     transform_pose,
 )
@@ -25,12 +24,8 @@ from flashdex.motions.contact.fingertips import (
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.contact.support import estimate_support
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.objects.meshes import clean_mesh, hull_vertices
-
-# turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
-UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
 
 
 @dataclass
@@ -183,33 +178,3 @@ def _assign(
     )
     kept = sorted(order[:NUM_OBJECT_SLOTS])
     return _Roles(kept, order[NUM_OBJECT_SLOTS:], chosen, tip_dist)
-
-
-def demo_support(
-    demo: HumanDemo, meshes: list[trimesh.Trimesh] | None = None
-) -> float | None:
-    """Height of the table that a recording's objects rest on; None if none rests.
-
-    Args:
-        demo: with NaN where an object was not tracked.
-        meshes: of its objects, cleaned, m; read by default.
-
-    Returns:
-        m, along the recording's up axis.
-
-    Raises:
-        MeshError: a mesh cannot be used.
-    """
-    if meshes is None:
-        meshes = [clean_mesh(b.load_mesh(), name=b.name) for b in demo.objects]
-    turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
-    poses, vertices = [], []
-    for body, mesh in zip(demo.objects, meshes, strict=True):
-        hull = hull_vertices(mesh)
-        for start, end in runs(~missing_frames(body.pose), least=3):
-            poses.append(transform_pose(body.pose[start:end], turn))
-            vertices.append(hull)
-    if not poses:
-        return None
-    height, found = estimate_support(poses, vertices, demo.fps)
-    return height if found else None

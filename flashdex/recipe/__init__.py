@@ -1,9 +1,12 @@
 """Recipes: schema (the one place of defaults), compose, validate, dump."""
 
 from flashdex.algorithms.config import AlgoConfig
-from flashdex.envs.config import AssistConfig, EnvConfig, GymConfig, ResetNoise
+from flashdex.envs.config import EnvConfig, GymConfig
+from flashdex.envs.mdp.assist import AssistConfig
 from flashdex.envs.mdp.options import REWARDS, TERMINATIONS, TRANSFORMS, build_options
+from flashdex.envs.mdp.resets import ResetNoise
 from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.metrics.criteria_table import CRITERIA, CriterionName
 from flashdex.recipe.check import validate
 from flashdex.recipe.compose import (
     compose,
@@ -14,13 +17,7 @@ from flashdex.recipe.compose import (
     override_recipe,
 )
 from flashdex.recipe.motions import MotionsConfig
-from flashdex.recipe.run import (
-    CRITERIA,
-    Criterion,
-    LoggerConfig,
-    LoopConfig,
-    TrainConfig,
-)
+from flashdex.recipe.run import LoggerConfig, LoopConfig, TrainConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import copy_recipe, find_recipe, list_recipes
 from flashdex.recipe.tasks import GymRecipe, expect_kind, require_motions, task_of_run
@@ -32,7 +29,7 @@ __all__ = [
     "TRANSFORMS",
     "AlgoConfig",
     "AssistConfig",
-    "Criterion",
+    "CriterionName",
     "EnvConfig",
     "Expectation",
     "GymConfig",

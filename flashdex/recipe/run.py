@@ -7,26 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
+from flashdex.metrics.criteria_table import CriterionName
 from flashdex.system.fields import number
-
-Criterion = Literal[
-    "sr_mt_obj",
-    "sr_mt",
-    "sr_mt_obj_x0.5",
-    "sr_mt_obj_x2",
-    "sr_mt_x0.5",
-    "sr_mt_x2",
-    "sr_loose",
-    "sr_mt_obj_frame",
-    "sr_mt_frame",
-    "sr_mt_obj_p95",
-    "sr_spider_centred",
-    "sr_spider_raw",
-    "sr_spider_worst",
-]
-CRITERIA: tuple[str, ...] = get_args(Criterion)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +42,7 @@ class TrainConfig(LoopConfig):
     cores."""
     stop_when_all_converted: bool = True
     """Stop once every motion is converted."""
-    criterion: Criterion = "sr_mt_obj"
+    criterion: CriterionName = "sr_mt_obj"
     """What counts as a conversion (see docs on criteria)."""
     judge: Literal["auto", "inline", "process"] = "auto"
     """Where attempts are scored and certified: in the loop, or in a process beside it;

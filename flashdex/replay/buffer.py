@@ -17,7 +17,6 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 
 from flashdex.errors import FlashdexError
-from flashdex.recipe import AlgoConfig
 from flashdex.replay.codec import row_bytes
 
 
@@ -229,39 +228,6 @@ class HostBuffer(RowBuffer):
         """Forget all rows, those on their way included."""
         self._coming.clear()
         super().empty(empty_write_count)
-
-
-def make_buffer(
-    config: AlgoConfig, *, device: torch.device, generator: torch.Generator, seed: int
-) -> RowBuffer:
-    """The replay buffer of a recipe.
-
-    Args:
-        config: algorithm part of the recipe.
-        device: of the learner.
-        generator: of the learner, on its device; it draws the samples as long as they
-            are drawn there, one after the other.
-        seed: of another one otherwise.
-
-    Raises:
-        FlashdexError: pinned memory without a CUDA device, or it cannot be had.
-    """
-    sizes = {"batch_size": config.batch_size, "device": device}
-    if config.replay in ("auto", "device"):
-        return RowBuffer(config.buffer_size, generator=generator, **sizes)
-    pinned = config.replay == "pinned"
-    if pinned:
-        check_pinning(device)
-    if device.type != "cpu" or config.prefetch:
-        generator = torch.Generator().manual_seed(seed)
-    return HostBuffer(
-        config.buffer_size,
-        generator=generator,
-        prefetch=config.prefetch,
-        stages=STAGES if pinned else 0,
-        pinned=pinned,
-        **sizes,
-    )
 
 
 def check_pinning(device: torch.device) -> None:

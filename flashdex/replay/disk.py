@@ -13,7 +13,7 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -21,7 +21,9 @@ from torchrl.data import ReplayBuffer
 
 from flashdex.replay.buffer import RowBuffer
 from flashdex.system.files import open_atomic, write_atomic
-from flashdex.training.checkpoint import FOLDER
+
+if TYPE_CHECKING:
+    from flashdex.replay.disk import ReplayLog
 
 _LOG = logging.getLogger(__name__)
 REPLAY = "replay"
@@ -206,3 +208,6 @@ class ReplayLog:
                 path.unlink()
         # after a failed save its segments are gone, and have to be written again
         self._segments = [s for s in self._segments if s.file in needed]
+
+
+FOLDER = "checkpoints"

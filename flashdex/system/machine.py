@@ -1,4 +1,4 @@
-"""What memory this machine has left: GPU, host, container, disk."""
+"""This machine: memory it has left, hardware, versions of what runs on it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from typing import Any, Literal
 
 import mujoco
 import torch
-
-from flashdex.training.checkpoint import FOLDER as CHECKPOINTS
 
 Pool = Literal["gpu", "host", "disk"]
 _MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
@@ -120,7 +118,7 @@ def _free_disk(folder: Path) -> int | None:
     if there is None:
         return None
     # a run that goes on replaces the checkpoints that it has
-    own = folder / CHECKPOINTS
+    own = folder / "checkpoints"
     had = sum(p.stat().st_size for p in own.rglob("*") if p.is_file())
     return shutil.disk_usage(there).free + had
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from flashdex.errors import RunError
+from flashdex.replay.disk import FOLDER
 from flashdex.system.files import open_atomic
 
 if TYPE_CHECKING:
     from flashdex.replay.disk import ReplayLog
 
 _LOG = logging.getLogger(__name__)
-FOLDER = "checkpoints"
 FORMAT = 2  # raised whenever older code could misread a checkpoint
 EVALUATED = ("env_steps", "learner", "recipe")
 RESUMED = (

@@ -11,7 +11,9 @@ from torch import nn
 
 from flashdex import keys
 from flashdex.algorithms.agent import make_actor, make_critic, make_encoder
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import state_spec
 from flashdex.envs.transforms.build import make_transforms
@@ -20,7 +22,6 @@ from flashdex.hands.spec import HandSpec
 from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
 from flashdex.modules.layers import warm_up_statistics
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.recipe import AlgoConfig, EnvConfig
 from flashdex.replay.codec import RowCodec, row_bytes
 from flashdex.training.memory_walk import (
     PeakMeter,

@@ -55,8 +55,8 @@ def make_state(library, bank, hands):
 @pytest.fixture(scope="session")
 def scenes(library, hands):
     """Compiled scenes of the three motions."""
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.scene.scene import build_scenes
-    from flashdex.recipe import PhysicsConfig
 
     return build_scenes(library, hands, PhysicsConfig())
 

@@ -7,9 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from flashdex.envs.mdp.assist import AssistSchedule
+from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
 from flashdex.envs.scene.wrench import assist_wrench
-from flashdex.recipe import AssistConfig
 
 GOOD = {"task": 1.0, "imitation": 1.0, "cloning": 1.0, "completion": 1.0}
 

@@ -10,11 +10,11 @@ from reduced import reduced_library
 
 from flashdex import keys
 from flashdex.envs.physics.brax.engine import BraxPhysics, refuse_unlike_objects
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError
-from flashdex.recipe import PhysicsConfig
 
 pytest.importorskip("brax", reason="needs the extra 'brax'")
 

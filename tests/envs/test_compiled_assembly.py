@@ -7,10 +7,10 @@ import torch
 from torch.nn.functional import normalize
 
 from flashdex import keys
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.transforms.base import assemble
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.envs.transforms.compiled import OUTPUTS, Assembly
-from flashdex.recipe import EnvConfig
 
 
 @pytest.fixture(scope="module")

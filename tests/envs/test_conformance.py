@@ -30,10 +30,10 @@ from engine_states import raw_state, reset_worlds
 from reduced import reduced_library
 
 from flashdex.envs.physics.base import Physics
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.envs.physics.make import make_physics as build_engine
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene, build_scenes
-from flashdex.recipe import PhysicsConfig
 
 ABSOLUTE = ("fall.formula", "spin.momentum", "grip.weight", "cradle.weight")
 BROKEN = MUTATIONS | FINE_MUTATIONS

@@ -8,9 +8,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from flashdex import keys
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.transforms.build import make_transforms
 from flashdex.envs.transforms.contact_code import decode_contact
-from flashdex.recipe import EnvConfig
 
 ROWS = 6
 WIDTHS = {  # a hand; both hands give the widths of method section 6

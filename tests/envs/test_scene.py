@@ -89,8 +89,8 @@ def test_contact_bits(scenes):
 
 
 def test_hands_pass_through_supports_when_asked(library, hands):
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.scene.scene import build_scenes
-    from flashdex.recipe import PhysicsConfig
 
     config = PhysicsConfig(hand_support_contact=False)
     model = build_scenes(library, hands, config)[0].model

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from flashdex import keys
-from flashdex.recipe import AssistConfig
+from flashdex.envs.mdp.assist import AssistConfig
 
 FLAGS = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
 NO_ENDS = {"terminations": {"sanity": {}}}

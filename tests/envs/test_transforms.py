@@ -9,9 +9,9 @@ from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from flashdex import keys
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.transforms.base import assemble
 from flashdex.envs.transforms.build import make_transforms
-from flashdex.recipe import EnvConfig
 
 BLOCKS = [n for n in EnvConfig().transforms if n != "future_window"]
 

@@ -24,8 +24,8 @@ def array_bytes(owner):
 
 @pytest.fixture(scope="module")
 def measured(library, hands):
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.warp.memory import measure_warp
-    from flashdex.recipe import PhysicsConfig
 
     return lambda **values: measure_warp(
         library, hands, PhysicsConfig(engine="warp", **values)
@@ -33,8 +33,8 @@ def measured(library, hands):
 
 
 def test_arrays_are_those_of_the_engine(measured, library, hands):
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.warp.engine import WarpPhysics
-    from flashdex.recipe import PhysicsConfig
 
     found = measured()
     few, more = (

@@ -21,8 +21,8 @@ FRAMES = torch.tensor([5, 10, 15])
 @pytest.fixture(scope="module")
 def make_warp(library, hands):
     """Build the warp engine: worlds, then fields of PhysicsConfig."""
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.warp.engine import WarpPhysics
-    from flashdex.recipe import PhysicsConfig
 
     def make(num_envs, **fields):
         return WarpPhysics(library, hands, PhysicsConfig(**fields), num_envs)
@@ -96,8 +96,8 @@ def make_wrench(start, bank, **fields):
 @pytest.fixture(scope="module")
 def cpu_like(library, hands):
     """The cpu engine, one thread, as many substeps as the warp engine."""
+    from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.cpu import CpuPhysics
-    from flashdex.recipe import PhysicsConfig
 
     def make(num_envs):
         return CpuPhysics(library, hands, PhysicsConfig(num_threads=1), num_envs)

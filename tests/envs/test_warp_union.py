@@ -12,12 +12,12 @@ import torch
 from synthetic import HALF, LENGTHS, make_ball, make_box, make_frames
 
 from flashdex import keys
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.errors import FlashdexError, MissingExtraError
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.recipe import PhysicsConfig
 
 pytest.importorskip("mujoco_warp")
 

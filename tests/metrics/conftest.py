@@ -1,8 +1,7 @@
-"""Hand-made rollouts: poses with known errors, and a scene stepped by MuJoCo C."""
+"""Poses with known errors."""
 
 import pytest
 import torch
-from pushed_box import SCENE, make_rollout, step_by_hand
 
 from flashdex.metrics.errors import compute_signals
 
@@ -50,23 +49,3 @@ def poses():
         return compute_signals(data, **masks)
 
     return build
-
-
-@pytest.fixture
-def rollout():
-    return make_rollout()
-
-
-@pytest.fixture
-def build_rollout():
-    return make_rollout
-
-
-@pytest.fixture
-def scene_xml():
-    return SCENE
-
-
-@pytest.fixture
-def oracle():
-    return step_by_hand

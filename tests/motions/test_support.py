@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from flashdex.datasets.support import estimate_support, still_runs
 from flashdex.motions.contact.fingertips import (
     CONTACT_DISTANCE,
     assign_object,
@@ -9,7 +10,7 @@ from flashdex.motions.contact.fingertips import (
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.contact.support import estimate_support, still_runs, support_disks
+from flashdex.motions.contact.support import support_disks
 
 FPS = 60.0
 BOX = trimesh.creation.box((0.08, 0.06, 0.04))

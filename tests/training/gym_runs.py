@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 
-from flashdex.recipe import AlgoConfig, GymConfig, GymRecipe, LoopConfig
+from flashdex.algorithms.config import AlgoConfig
+from flashdex.envs.config import GymConfig
+from flashdex.recipe import GymRecipe, LoopConfig
 from flashdex.replay.disk import ReplayLog
 from flashdex.training.gym_run import make_gym_learner
 from flashdex.training.gym_trainer import GymTrainer

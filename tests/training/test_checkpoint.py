@@ -16,9 +16,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from flashdex.algorithms.base import snapshot
 from flashdex.errors import RunError
 from flashdex.replay import disk as replay_file
-from flashdex.replay.disk import ReplayLog
+from flashdex.replay.disk import FOLDER, ReplayLog
 from flashdex.training.checkpoint import (
-    FOLDER,
     checkpoint_names,
     load_checkpoint,
     remove_temporaries,

@@ -11,8 +11,8 @@ from no_sync import forbid_sync
 from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
+from flashdex.envs.mdp.assist import AssistConfig
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.recipe import AssistConfig
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import LOOK_EVERY, AttemptRing
 from flashdex.rollouts.scorer import JudgeHere

@@ -14,8 +14,9 @@ import torch
 from gym_runs import STEPS, TINY, read_metrics, tiny_recipe, trainer_of
 
 from flashdex.cli.main import main
+from flashdex.envs.config import GymConfig
 from flashdex.envs.gym import GymWorlds
-from flashdex.recipe import GymConfig, GymRecipe, compose
+from flashdex.recipe import GymRecipe, compose
 from flashdex.training.evaluator import evaluate_policy, observed
 from flashdex.training.gym_run import make_gym_learner, train_gym
 

@@ -8,8 +8,11 @@ import pytest
 import torch
 from torch import nn
 
+from flashdex.algorithms.config import AlgoConfig
+from flashdex.envs.config import EnvConfig
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
-from flashdex.recipe import AlgoConfig, EnvConfig, PhysicsConfig, Recipe
+from flashdex.recipe import Recipe
 from flashdex.system.machine import Machine
 from flashdex.training import memory
 from flashdex.training.memory import (

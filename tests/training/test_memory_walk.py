@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.common.ceilings import count_products, total_flops
 from flashdex.algorithms.agent import make_actor, make_critic
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.recipe import AlgoConfig
 from flashdex.training.memory_walk import (
     PeakMeter,
     flashsac_flops,

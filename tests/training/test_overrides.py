@@ -8,9 +8,10 @@ import json
 import pytest
 import torch
 
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.cli.main import main
 from flashdex.errors import RunError
-from flashdex.recipe import AlgoConfig, Recipe, dump_recipe
+from flashdex.recipe import Recipe, dump_recipe
 from flashdex.system.files import run_lock
 from flashdex.training.checkpoint import RESUMED, load_checkpoint
 from flashdex.training.run_dir import RECIPE, new_run, resume

@@ -86,7 +86,7 @@ def test_rows_are_scored_on_the_right_frames(attempts, library):
 
 def test_training_attempts_replay_bit_equal_after_resets(make_env):
     # worlds that were reset many times, beside assisted and terminated neighbours
-    from flashdex.recipe import AssistConfig
+    from flashdex.envs.mdp.assist import AssistConfig
 
     env = make_env(
         6,

@@ -24,10 +24,10 @@ from flashdex.datasets.oakink2.annotation import (
     read_program,
 )
 from flashdex.datasets.roots import refuse_pointer, relative
+from flashdex.datasets.support import estimate_support
 from flashdex.datasets.tracks import palm_frame, transform_pose
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
-from flashdex.motions.contact.support import estimate_support
 from flashdex.objects.meshes import hull_vertices, load_mesh
 
 FPS = 120.0

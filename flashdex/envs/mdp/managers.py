@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex import keys
+from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp import rewards, terminations
 from flashdex.envs.mdp.options import build_options
 from flashdex.envs.reference import ReferenceBank
@@ -18,7 +19,6 @@ from flashdex.envs.transforms.features import gather_own, tip_distance
 from flashdex.geometry.rotation import quat_angle
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.recipe import EnvConfig
 
 
 @dataclass

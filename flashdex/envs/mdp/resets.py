@@ -11,9 +11,10 @@ from torch import Tensor
 
 from flashdex.envs.mdp.samplers import start_frames
 from flashdex.envs.reference import ReferenceBank
+from flashdex.system.fields import number
 
 if TYPE_CHECKING:
-    from flashdex.recipe import ResetNoise
+    pass
 
 
 @dataclass(frozen=True)
@@ -101,3 +102,19 @@ def reset_state(
         "object_pose": torch.cat([ref["object_pos"], ref["object_quat"]], -1),
         "object_vel": torch.cat([ref["object_linvel"], ref["object_angvel"]], -1),
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetNoise:
+    """Standard deviations of the start state around the reference."""
+
+    wrist_pos: float = number(0.001, low=0)
+    """Wrist position, m."""
+    wrist_rot_deg: float = number(1.0, low=0)
+    """Wrist orientation, degrees."""
+    finger_range: float = number(0.0125, low=0)
+    """Finger joints, share of the joint range."""
+    wrist_vel: float = number(0.001, low=0)
+    """Added to the wrist velocity, m/s and rad/s."""
+    finger_vel: float = number(0.01, low=0)
+    """Replaces the finger velocity, rad/s."""

@@ -1,4 +1,4 @@
-"""TODO docstring."""
+"""Configuration of the physics: the engine and its numbers."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 # Bit masks of method section 5: hands meet hands and objects, objects meet objects.
 HAND_BITS = (1, 1)

@@ -31,7 +31,7 @@ from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 PARKED = {"left": (-4.0, 0.0, 3.0), "right": (4.0, 0.0, 3.0)}  # m, idle hands
 

@@ -29,7 +29,7 @@ from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 # Arrays of the model that differ by design: assets, and one set of sensors a slot.
 _OWN = ("mesh_", "sensor_")

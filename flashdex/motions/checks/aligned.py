@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from flashdex.datasets.demo import UP_ROTATION
+from flashdex.datasets.support import lowest_points, still_runs
 from flashdex.datasets.tracks import rotation, runs
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.keys import TIP_KEYPOINTS
-from flashdex.motions.align import UP_ROTATION, AlignedDemo
+from flashdex.motions.align import AlignedDemo
 from flashdex.motions.checks.objects import check_objects, check_overlap
 from flashdex.motions.checks.recording import Finding, reject
 from flashdex.motions.contact.activity import MOVE_TRAVEL, MOVE_TURN, motion_of
-from flashdex.motions.contact.support import lowest_points, still_runs
 from flashdex.motions.retarget.penetration import Penetration
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices

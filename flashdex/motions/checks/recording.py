@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.demo import MAX_SECONDS, MIN_SECONDS, HumanDemo
 from flashdex.datasets.tracks import linear_velocity, rotation
 from flashdex.keys import Side
 from flashdex.motions.align import AlignedDemo
@@ -20,7 +20,6 @@ from flashdex.motions.repair.jumps import jump_steps
 Level = Literal["info", "warn", "reject"]
 Status = Literal["kept", "flagged", "rejected"]
 
-MIN_SECONDS, MAX_SECONDS = 1.0, 20.0
 JUMP_EVENTS = 5
 PALM_LENGTH = (0.06, 0.12)  # m, wrist to middle MCP
 TRAVEL = (1.5, 3.0)  # m, of a hand or an object in one motion: warn and reject

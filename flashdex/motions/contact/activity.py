@@ -9,6 +9,7 @@ import trimesh
 from scipy.ndimage import uniform_filter1d
 
 from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.support import STILL_SPEED, STILL_TURN
 from flashdex.datasets.tracks import (
     angular_velocity,
     linear_velocity,
@@ -17,7 +18,6 @@ from flashdex.datasets.tracks import (
     runs,
 )
 from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
-from flashdex.motions.contact.support import STILL_SPEED, STILL_TURN
 from flashdex.objects.meshes import reduce_mesh
 from flashdex.objects.signed_distance import surface_distance
 

@@ -1,67 +1,17 @@
-"""Support surfaces from objects at rest: table height and thin discs."""
+"""Support surfaces of a motion: thin discs under objects at rest."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from flashdex.datasets.tracks import angular_velocity, linear_velocity, rotation, runs
+from flashdex.datasets.support import LEVEL_GAP, still_runs
+from flashdex.datasets.tracks import rotation
 
-STILL_SPEED = 0.03  # m/s
-STILL_TURN = 0.3  # rad/s
-STILL_SECONDS = 1 / 6
-# heights closer than this are one level, m
-LEVEL_GAP = 0.05
 NUM_DISKS = 4
 RADIUS_CLASSES = (0.08, 0.15, 0.25, 0.40)
 DISK_HEIGHT = 0.01
 TABLE_HEIGHT = 0.02
 TABLE_MARGIN = 0.40
-
-
-def still_runs(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
-    """Runs of frames (start, end excluded) in which a pose track (T, 7) rests.
-
-    Still = slower than 0.03 m/s and 0.3 rad/s for at least 1/6 s.
-    """
-    speed = np.linalg.norm(linear_velocity(pose[:, :3], fps, sigma=1.0), axis=-1)
-    turn = np.linalg.norm(angular_velocity(pose[:, 3:], fps, sigma=1.0), axis=-1)
-    least = max(int(np.ceil(STILL_SECONDS * fps)), 2)
-    return runs((speed < STILL_SPEED) & (turn < STILL_TURN), least=least)
-
-
-def lowest_points(pose: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Lowest mesh vertex in every frame of a pose track (T, 7), m, (T,)."""
-    up = rotation(pose[:, 3:]).as_matrix()[:, 2]  # third row: R v, z component
-    return (up @ vertices.T).min(axis=1) + pose[:, 2]
-
-
-def estimate_support(
-    poses: list[np.ndarray], vertices: list[np.ndarray], fps: float
-) -> tuple[float, bool]:
-    """Height of the main table from objects at rest, with mesh vertices.
-
-    The lowest level that holds a still run at the start or the end of the motion;
-    without one, the lowest still run; without any, the lowest vertex of all frames.
-
-    Args:
-        poses: per object (T, 7).
-        vertices: per object (V, 3), m, object frame.
-        fps: frames a second.
-
-    Returns:
-        Height, m, and whether anything was at rest there.
-    """
-    at_ends, inside = [], []
-    lows = [lowest_points(p, v) for p, v in zip(poses, vertices, strict=True)]
-    for pose, low in zip(poses, lows, strict=True):
-        for start, end in still_runs(pose, fps):
-            outer = start == 0 or end == len(pose)
-            (at_ends if outer else inside).append(float(np.median(low[start:end])))
-    heights = at_ends or inside
-    if not heights:
-        return float(min(low.min() for low in lows)), False
-    lowest = min(heights)
-    return float(np.median([h for h in heights if h < lowest + LEVEL_GAP / 5])), True
 
 
 def support_disks(

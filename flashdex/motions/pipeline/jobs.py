@@ -13,10 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.demo import MAX_SECONDS, HumanDemo
 from flashdex.datasets.source import Recording
 from flashdex.errors import DemoError, LibraryError, MeshError
-from flashdex.motions.checks.recording import MAX_SECONDS, Finding, concerning
+from flashdex.motions.checks.recording import Finding, concerning
 from flashdex.motions.pipeline.cache import cache_file, read_prepared, write_prepared
 from flashdex.motions.pipeline.motion import (
     MotionSettings,

@@ -11,7 +11,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flashdex.datasets.demo import QUAT_TOLERANCE, DemoObject, HumanDemo
+from flashdex.datasets.demo import (
+    MAX_SECONDS,
+    MIN_SECONDS,
+    QUAT_TOLERANCE,
+    DemoObject,
+    HumanDemo,
+)
+from flashdex.datasets.support import demo_support
 from flashdex.datasets.tracks import (
     FARTHEST,
     align_signs,
@@ -23,15 +30,7 @@ from flashdex.datasets.tracks import (
 )
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.align import demo_support
-from flashdex.motions.checks.recording import (
-    FILLED,
-    JUMP_EVENTS,
-    MAX_SECONDS,
-    MIN_SECONDS,
-    Finding,
-    reject,
-)
+from flashdex.motions.checks.recording import FILLED, JUMP_EVENTS, Finding, reject
 from flashdex.motions.repair.jumps import outliers
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation

@@ -9,18 +9,12 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
-from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.demo import MAX_SECONDS, MIN_SECONDS, HumanDemo
+from flashdex.datasets.support import demo_support
 from flashdex.datasets.tracks import missing_frames, runs
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.align import demo_support
-from flashdex.motions.checks.recording import (
-    FILLED,
-    MAX_SECONDS,
-    MIN_SECONDS,
-    Finding,
-    reject,
-)
+from flashdex.motions.checks.recording import FILLED, Finding, reject
 from flashdex.motions.contact.activity import (
     TOUCH_SECONDS,
     Activity,

@@ -1,4 +1,4 @@
-"""TODO docstring."""
+"""What the retargeting aims at: joints, tips and wrists of the human hand."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.contact.fingertips import contact_runs
 from flashdex.motions.library import MotionLibrary
-from flashdex.reports import film
+from flashdex.reports.render import films
 from flashdex.reports.render.rollout import (
     AZIMUTHS,
     ELEVATION,
@@ -53,14 +53,14 @@ def draw_thumbnails(
         JPEG data by motion row, and why pictures are missing, empty when all are there.
         Never raises: a library is worth reporting without pictures.
     """
-    backend = film.find_backend() if rows else None
+    backend = films.find_backend() if rows else None
     if backend is None:
-        return {}, film.NO_GRAPHICS if rows else ""
+        return {}, films.NO_GRAPHICS if rows else ""
     with tempfile.TemporaryDirectory(prefix="flashdex-stills-") as folder:
         module = "flashdex.reports.render.stills"
         words = ["-m", module, str(library.path.resolve()), folder, *map(str, rows)]
         timeout = 60 + SECONDS_A_MOTION * len(rows)
-        fault = film.run_drawer(words, backend, timeout=timeout)
+        fault = films.run_drawer(words, backend, timeout=timeout)
         files = {row: Path(folder) / f"{row}.jpg" for row in rows}
         drawn = {row: f.read_bytes() for row, f in files.items() if f.is_file()}
     if len(drawn) == len(rows):

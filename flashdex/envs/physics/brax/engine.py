@@ -30,7 +30,7 @@ from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
     from flashdex.envs.physics.brax.wrench import WrenchInputs
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 
 def brax_device() -> torch.device:

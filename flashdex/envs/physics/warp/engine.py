@@ -28,7 +28,7 @@ from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 _log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from flashdex.keys import Side
 from flashdex.motions.library import MotionLibrary
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 # Below two worlds some arrays have a row more than worlds.
 _FEW, _MORE = 2, 10

@@ -14,7 +14,7 @@ from flashdex.envs.scene.union import SceneUnion
 from flashdex.errors import FlashdexError, MissingExtraError
 
 if TYPE_CHECKING:
-    from flashdex.recipe import PhysicsConfig
+    from flashdex.envs.physics.config import PhysicsConfig
 
 # Only read by sleeping, which no scene uses.
 _UNREAD = {"dof_length"}

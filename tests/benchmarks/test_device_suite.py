@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import pytest
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
 def suite():
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield load("device_suite")
-    finally:
-        sys.path.remove(str(FOLDER))
+    return load("device_suite")
 
 
 def load(name):
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"benchmarks.{name}")
 
 
 @pytest.fixture
@@ -101,7 +91,10 @@ def test_every_part_has_commands_that_exist(suite, tmp_path, tiny):
         jobs = suite.jobs_of(part, choice)
         assert len({job.name for job in jobs}) == len(jobs) > 0
         for job in jobs:
-            make_parser().parse_args(job.words)
+            module, *words = job.words
+            assert importlib.util.find_spec(module)
+            if module.startswith("flashdex"):
+                make_parser().parse_args(words)
 
 
 def test_tables_are_rendered_and_put_between_their_marks():

@@ -17,7 +17,7 @@ from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
 from flashdex.datasets.arctic import ARCTIC
-from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.demo import UP_ROTATION, DemoObject, HumanDemo
 from flashdex.datasets.fdr.reader import FDR
 from flashdex.datasets.grab import GRAB
 from flashdex.datasets.hot3d.reader import HOT3D
@@ -27,7 +27,6 @@ from flashdex.datasets.source import Source, SourceOptions
 from flashdex.datasets.spider.reader import SPIDER
 from flashdex.datasets.taco.reader import TACO
 from flashdex.datasets.tracks import palm_frame
-from flashdex.motions.align import UP_ROTATION
 
 SECONDS = 2.0
 COMMON = 10.0  # Hz, the times that every rate has

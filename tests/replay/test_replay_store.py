@@ -9,9 +9,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.flashsac import make_buffer
 from flashdex.errors import FlashdexError
-from flashdex.recipe import AlgoConfig
-from flashdex.replay.buffer import HostBuffer, RowBuffer, RowStorage, make_buffer
+from flashdex.replay.buffer import HostBuffer, RowBuffer, RowStorage
 from flashdex.replay.disk import ReplayLog
 
 CPU = torch.device("cpu")

@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from flashdex.recipe import AlgoConfig, EnvConfig, PhysicsConfig, Recipe, TrainConfig
+from flashdex.algorithms.config import AlgoConfig
+from flashdex.envs.config import EnvConfig
+from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.recipe import Recipe, TrainConfig
 
 TINY = {
     "batch_size": 32,

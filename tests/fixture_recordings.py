@@ -11,7 +11,7 @@ from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.tracks import palm_frame
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[1]
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
-from flashdex.reports import library_report
+from flashdex.reports.library import report as library_report
 from flashdex.reports.library.cards import contact_timeline, motion_charts
 from flashdex.reports.library.facts import CODES, RecordingFacts, library_facts
 from flashdex.reports.library.report import (

@@ -16,10 +16,10 @@ from flashdex.datasets.procedural.reader import (
     procedural,
     smooth_noise,
 )
+from flashdex.datasets.support import lowest_points
 from flashdex.errors import UnknownSourceError
 from flashdex.keys import SIDES
 from flashdex.motions.contact.fingertips import tip_distances
-from flashdex.motions.contact.support import lowest_points
 
 SINGLE = [k for k in KINDS if k.startswith("pick") and k.endswith("right")]
 CARRY = slice(60, 110)  # frames in which the hand surely holds the object

@@ -12,7 +12,7 @@ import flashdex
 from flashdex.cli.doctor import Finding, examine, format_report
 from flashdex.cli.main import main
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from flashdex.reports import film
+from flashdex.reports.render import films
 from flashdex.reports.render.films import NO_GRAPHICS, Film, draw_films, find_backend
 from flashdex.reports.render.rollout import MARGIN, fit_view, view_axes
 from flashdex.reports.run.report import write_report
@@ -37,7 +37,7 @@ def draw(rollout, folder, backend):
     """One picture, made in a process of its own."""
     stored, target = rollout.save(folder / "one.npz"), folder / "one.npy"
     assert (
-        film.run_drawer(["-c", DRAW, str(stored), str(target)], backend, timeout=120)
+        films.run_drawer(["-c", DRAW, str(stored), str(target)], backend, timeout=120)
         == ""
     )
     return np.load(target).astype(int)

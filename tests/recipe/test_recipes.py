@@ -10,16 +10,15 @@ from typing import get_args, get_type_hints
 import pytest
 import yaml
 
+from flashdex.envs.config import GymConfig
 from flashdex.envs.mdp.options import REGISTRY
+from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError, RecipeError, UnknownRecipeError
 from flashdex.hands.gains import GainsPreset
-from flashdex.metrics.criteria_table import criterion_names
+from flashdex.metrics.criteria_table import CRITERIA, criterion_names
 from flashdex.recipe import (
-    CRITERIA,
-    GymConfig,
     GymRecipe,
     MotionsConfig,
-    PhysicsConfig,
     Recipe,
     compose,
     compose_runs,
@@ -29,7 +28,7 @@ from flashdex.recipe import (
     validate,
 )
 
-RECIPES = Path(__file__).parent.parent / "recipes"
+RECIPES = Path(__file__).parents[2] / "recipes"
 NAMES = sorted(path.stem for path in RECIPES.glob("*.yaml"))
 GROUPS = sorted(RECIPES.glob("*/*.yaml"))
 ABLATIONS = sorted(path.stem for path in (RECIPES / "ablation").glob("*.yaml"))

@@ -12,7 +12,7 @@ from flashdex.cli.main import main
 from flashdex.system.machine import Machine
 from flashdex.training import memory
 
-PAGE = Path(__file__).parent.parent / "docs" / "memory.md"
+PAGE = Path(__file__).parents[2] / "docs" / "memory.md"
 GB = 10**9
 
 

@@ -456,7 +456,7 @@ def _device(name: str) -> torch.device:
     is_there = torch.cuda.is_available()
     if name == "cuda" and not is_there:
         raise FlashdexError(
-            "benchmarks.learner: --device cuda, but torch sees no GPU ('flashdex doctor' "
+            "--device cuda, but torch sees no GPU ('flashdex doctor' "
             "says why). Use --device cpu or auto."
         )
     return torch.device("cuda" if is_there and name != "cpu" else "cpu")

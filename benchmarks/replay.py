@@ -140,13 +140,13 @@ _HOST = torch.device("cpu")
 def _refuse(rows: int, width: int, kept_on: torch.device) -> None:
     if rows < PUSH:
         raise FlashdexError(
-            f"benchmarks.replay: --rows {rows} is less than the {PUSH} that are written at "
+            f"--rows {rows} is less than the {PUSH} that are written at "
             "once. Ask for more."
         )
     needed, free = rows * width, free_memory(kept_on)
     if needed > SPARE * free:
         raise FlashdexError(
-            f"benchmarks.replay: {rows} rows of {width} bytes are {needed / 1e9:.1f} GB, "
+            f"{rows} rows of {width} bytes are {needed / 1e9:.1f} GB, "
             f"and {kept_on} has {free / 1e9:.1f} GB free, of which {SPARE:.0%} may be "
             "taken. Ask for fewer --rows, or on a GPU for --replay pinned."
         )

@@ -17,7 +17,7 @@ from flashdex.algorithms.base import snapshot
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.transforms.compiled import Assembly
+from flashdex.envs.transforms.assembly import Assembly
 from flashdex.modules.layers import restore_generator
 from flashdex.replay.buffer import STAGES, HostBuffer, RowBuffer, check_pinning
 from flashdex.replay.codec import RowCodec, RowPatch, finite_rows

@@ -84,11 +84,8 @@ class ReferenceBank(nn.Module):
         own = torch.gather(rows, 1, slot.clamp_min(0)).clamp_min(0)
         self.register_buffer("hand_object", own)
         objects = _plain(library.objects)
-        self.register_buffer("points", objects["points"].float())
-        self.register_buffer("radius", objects["radius"].float())
-        self.register_buffer("mass", objects["mass"].float())
-        self.register_buffer("inertia", objects["inertia"].float())
-        self.register_buffer("com", objects["com"].float())
+        for name in ("points", "radius", "mass", "inertia", "com"):
+            self.register_buffer(name, objects[name].float())
         self.sdf = SdfGrid(
             objects["sdf"].float(),
             objects["sdf_origin"].float(),
@@ -163,12 +160,8 @@ class ReferenceBank(nn.Module):
     def _columns(
         self, frames: TensorDict, slot: Tensor, hands: dict[keys.Side, HandSpec]
     ) -> dict[str, Tensor]:
-        take = slot.clamp_min(0)
-
         def own(name: str) -> Tensor:
-            values = frames[name].float()
-            index = take.unsqueeze(-1).expand(-1, -1, values.shape[-1])
-            return torch.gather(values, 1, index)
+            return gather_own(frames[name].float(), slot.clamp_min(0))
 
         tips = list(keys.TIP_KEYPOINTS)
         mapped = [[k for _, k in hands[s].keypoint_links] for s in keys.SIDES]
@@ -176,20 +169,13 @@ class ReferenceBank(nn.Module):
         pick = pick[None, :, :, None].expand(frames.shape[0], -1, -1, 3)
         keypoints = frames["keypoints"].float()
         keypoint_vel = frames["keypoint_linvel"].float()
-        per_hand = {
-            name: frames[name].float()
-            for name in (
-                "joint_pos",
-                "joint_vel",
-                "wrist_pos",
-                "wrist_quat",
-                "wrist_linvel",
-                "wrist_angvel",
-                "tip_dist",
-            )
-        }
+        per_hand = (
+            *("joint_pos", "joint_vel", "wrist_pos", "wrist_quat"),
+            *("wrist_linvel", "wrist_angvel", "tip_dist"),
+        )
+        objects = ("object_pos", "object_quat", "object_linvel", "object_angvel")
         return {
-            **per_hand,
+            **{name: frames[name].float() for name in per_hand},
             "tip_pos": keypoints[:, :, tips],
             "tip_linvel": keypoint_vel[:, :, tips],
             "link_pos": torch.gather(keypoints, 2, pick),
@@ -198,10 +184,7 @@ class ReferenceBank(nn.Module):
             "own_quat": own("object_quat"),
             "own_linvel": own("object_linvel"),
             "own_angvel": own("object_angvel"),
-            "object_pos": frames["object_pos"].float(),
-            "object_quat": frames["object_quat"].float(),
-            "object_linvel": frames["object_linvel"].float(),
-            "object_angvel": frames["object_angvel"].float(),
+            **{name: frames[name].float() for name in objects},
         }
 
     def _pack(self, columns: dict[str, Tensor]) -> Tensor:
@@ -213,6 +196,18 @@ class ReferenceBank(nn.Module):
             flat.append(values.reshape(len(values), width))
             offset += width
         return torch.cat(flat, -1).contiguous()
+
+
+def gather_own(values: Tensor, slot: Tensor) -> Tensor:
+    """Pick each hand's own object: (N, O, C) by slots (N, 2) to (N, 2, C)."""
+    index = slot.unsqueeze(-1).expand(-1, -1, values.shape[-1])
+    return torch.gather(values, 1, index)
+
+
+def stack_hands(hands: dict[keys.Side, HandSpec], name: str) -> Tensor:
+    """Numbers of both hands' specs, left first, (2, ...)."""
+    values = [torch.as_tensor(getattr(hands[side], name)) for side in keys.SIDES]
+    return torch.stack(values).float()
 
 
 def _plain(mapped: TensorDict) -> dict[str, Tensor]:

@@ -9,20 +9,21 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Size, Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
 from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
-from flashdex.envs.mdp.managers import Judge, Outcome, Scoring, StepInfo
+from flashdex.envs.mdp.manager import TermManager
 from flashdex.envs.mdp.resets import ResetDraw, draw_reset, reset_state
 from flashdex.envs.mdp.samplers import SAMPLERS, UnconvertedSampler
+from flashdex.envs.mdp.step import StepResult, TermContext
 from flashdex.envs.physics.base import Physics
-from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.wrench import ObjectWrench, hold_share
-from flashdex.envs.transforms.contact_code import CODE_WIDTH, contact_code
+from flashdex.envs.transforms.contact import CODE_WIDTH, contact_code
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 
@@ -71,24 +72,35 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
     return Composite(leaves, shape=(n,))
 
 
+def _by_side(num_envs: int, leaves: Callable[[], dict[str, TensorSpec]]) -> Composite:
+    shape = (num_envs,)
+    sides = {side: Composite(leaves(), shape=shape) for side in keys.SIDES}
+    return Composite(sides, shape=shape)
+
+
 def action_spec(num_envs: int, joints: int) -> Composite:
     """Actions of both hands in [-1, 1], (N, J) each."""
-    n = num_envs
-    sides = {
-        s: Composite({keys.ACTION: Bounded(-1.0, 1.0, Size((n, joints)))}, shape=(n,))
-        for s in keys.SIDES
-    }
-    return Composite(sides, shape=(n,))
+    shape = Size((num_envs, joints))
+    return _by_side(num_envs, lambda: {keys.ACTION: Bounded(-1.0, 1.0, shape)})
 
 
 def reward_spec(num_envs: int) -> Composite:
     """Rewards of both hands, (N, 1) each."""
-    n = num_envs
-    sides = {
-        s: Composite({keys.REWARD: Unbounded(Size((n, 1)))}, shape=(n,))
-        for s in keys.SIDES
-    }
-    return Composite(sides, shape=(n,))
+    return _by_side(num_envs, lambda: {keys.REWARD: Unbounded(Size((num_envs, 1)))})
+
+
+def scored_spec(num_envs: int, names: list[str]) -> Composite:
+    """What a step says of each hand: failed, and the raw value of each reward."""
+    shape = Size((num_envs, 1))
+
+    def leaves() -> dict[str, TensorSpec]:
+        terms = {name: Unbounded(shape) for name in names}
+        return {
+            keys.FAILED: Binary(1, shape, dtype=torch.bool),
+            keys.REWARD_TERMS: Composite(terms, shape=(num_envs,)),
+        }
+
+    return _by_side(num_envs, leaves)
 
 
 def done_spec(num_envs: int) -> Composite:
@@ -100,11 +112,12 @@ def done_spec(num_envs: int) -> Composite:
 
 
 class TrackingEnv(EnvBase):
-    """Batched, batch-locked, with partial resets; emits the compact state only.
+    """Batched, batch-locked, with partial resets; emits the compact state.
 
     Worlds ``0 .. num_attempts - 1`` always start at frame 0 without assist and without
     reset noise: their finished episodes are attempts. Actions are
-    ``("left", "action")`` and ``("right", "action")`` in [-1, 1]; rewards are per hand;
+    ``("left", "action")`` and ``("right", "action")`` in [-1, 1]; per hand are also
+    ``reward``, ``failed`` and the raw ``reward_terms`` by name (0 after a reset);
     ``done``, ``terminated`` and ``truncated`` stand at the root only.
 
     Args:
@@ -136,24 +149,24 @@ class TrackingEnv(EnvBase):
         self.physics, self.bank, self.hands, self.config = physics, bank, hands, config
         self.step_dt = step_dt
         # Looking at a flag is free on the cpu; a device would have to be waited for.
-        self.host_sees = device.type == "cpu"
+        self.is_host_device = device.type == "cpu"
         self.group_map, self.num_envs = {side: [side] for side in keys.SIDES}, n
         self.num_attempts = n if evaluation else round(config.attempt_share * n)
         self.attempt = torch.arange(n, device=device) < self.num_attempts
         self.kinematics = HandKinematics(hands).to(device)
-        ranges = [torch.as_tensor(hands[s].joint_range) for s in keys.SIDES]
-        self.joint_range = torch.stack(ranges).float().to(device)
+        self.joint_range = stack_hands(hands, "joint_range").to(device)
         self.lead_s = (torch.zeros(()) if lead_s is None else lead_s).to(device)
-        self.judge = Judge(
-            bank,
-            hands,
-            config,
-            step_dt=step_dt,
-            num_envs=n,
-            lead_s=self.lead_s,
-            evaluation=evaluation,
+        context = TermContext(
+            *(bank, n, step_dt, self.lead_s, self.joint_range),
+            tip_radius=stack_hands(hands, "tip_radius").to(device),
         )
-        self._score = Scoring(self.judge, self.kinematics, compile=config.compile)
+        self.terms = TermManager(
+            context, config, self.kinematics, evaluation=evaluation
+        )
+        # Some five hundred small operations; compiled they are a few kernels.
+        self._score: Callable[..., tuple[StepResult, Tensor]] = self.terms
+        if config.compile:
+            self._score = torch.compile(self.terms.__call__, fullgraph=True)
         self.sampler = SAMPLERS[config.sampler](bank.num_motions, device=device)
         self.attempt_sampler = UnconvertedSampler(bank.num_motions, device=device)
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
@@ -173,7 +186,11 @@ class TrackingEnv(EnvBase):
         self._target = torch.zeros(n, 2, self.joint_range.shape[1], device=device)
         shape = (n, 2, hands["left"].num_links, CODE_WIDTH)
         self._contact = torch.zeros(shape, dtype=torch.int8, device=device)
-        self.info: StepInfo | None = None
+        # Of the last step, by hand.
+        names = len(self.terms.reward_names)
+        self._reward_terms = torch.zeros(2, names, n, 1, device=device)
+        self._failed = torch.zeros(n, 2, dtype=torch.bool, device=device)
+        self._last_step: StepResult | None = None
         self._make_specs()
         self.generator = torch.Generator(device)
         self.set_seed(seed)
@@ -187,16 +204,18 @@ class TrackingEnv(EnvBase):
     def _make_specs(self) -> None:
         n, joints = self.num_envs, self.joint_range.shape[1]
         links = self.hands["left"].num_links
-        self.observation_spec = state_spec(n, joints, self.bank.num_slots, links)
+        spec = state_spec(n, joints, self.bank.num_slots, links)
+        spec.update(scored_spec(n, self.terms.reward_names))
+        self.observation_spec = spec
         self.action_spec = action_spec(n, joints)
         self.reward_spec = reward_spec(n)
         self.full_done_spec = done_spec(n)
 
     @property
-    def last_outcome(self) -> Outcome:
-        """How the last step was judged."""
-        assert self.info is not None, "no step yet"
-        return self.info.outcome
+    def last_step(self) -> StepResult:
+        """What the last step was worth."""
+        assert self._last_step is not None, "no step yet"
+        return self._last_step
 
     def put_action(self, td: TensorDictBase, action: Tensor) -> None:
         """Write the actions of both hands, (N, 2, J), from any device into ``td``."""
@@ -222,9 +241,9 @@ class TrackingEnv(EnvBase):
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is not None:
             mask = asked.reshape(self.num_envs)
-        return self.restart(mask)
+        return self.reset_worlds(mask)
 
-    def restart(self, mask: Tensor) -> TensorDict:
+    def reset_worlds(self, mask: Tensor) -> TensorDict:
         """Begin new episodes in some worlds; what the coming step starts from.
 
         The same as ``reset`` of the worlds marked in ``_reset``, without the checks
@@ -237,12 +256,12 @@ class TrackingEnv(EnvBase):
             State and flags of all worlds, batch (N,).
         """
         with few_threads(self.num_envs):
-            out = self._restart(mask)
+            out = self._reset_worlds(mask)
         for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
             out[key] = torch.zeros_like(mask).unsqueeze(-1)
         return out
 
-    def _restart(self, mask: Tensor) -> TensorDict:
+    def _reset_worlds(self, mask: Tensor) -> TensorDict:
         draw = self._draw()
         start = reset_state(draw, self.bank, self.joint_range)
         self.physics.reset(mask, draw.motion, **start)
@@ -253,15 +272,17 @@ class TrackingEnv(EnvBase):
         rows = mask[:, None, None]
         self._filter = torch.where(rows, 0.0, self._filter)
         self._target = torch.where(rows, start["joint_pos"], self._target)
-        self.judge.reset(mask)
+        self.terms.reset(mask)
         state = self.physics.state()
         self._contact = self._contact.clone()
-        ids = mask.nonzero().squeeze(-1) if self.host_sees else slice(None)
+        ids = mask.nonzero().squeeze(-1) if self.is_host_device else slice(None)
         kin = self.kinematics(state[keys.JOINT_POS][ids], None)
         code = contact_code(state[keys.CONTACT][ids], kin)
-        if not self.host_sees:
+        if not self.is_host_device:
             code = torch.where(rows.unsqueeze(-1), code, self._contact)
         self._contact[ids] = code
+        self._failed = self._failed & ~mask.unsqueeze(-1)
+        self._reward_terms = torch.where(mask[:, None], 0.0, self._reward_terms)
         return self._observation(state)
 
     def _draw(self) -> ResetDraw:
@@ -292,18 +313,25 @@ class TrackingEnv(EnvBase):
         self._act(action, ref)
         state = self.physics.state()
         self.steps = self.steps + 1
-        outcome, self._contact = self._score(
-            state, action, ref, self._target, self.motion, self.steps
-        )
         scored = self.frame
-        self.info = StepInfo(outcome, scored, self.motion)
-        terminated = outcome.blame.any(-1, keepdim=True)
+        result, self._contact = self._score(
+            state,
+            ref,
+            action=action,
+            target=self._target,
+            motion=self.motion,
+            frame=scored,
+            steps=self.steps,
+        )
+        self._last_step, self._failed = result, result.failed
+        self._reward_terms = result.stacked_terms()
+        terminated = result.failed.any(-1, keepdim=True)
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
         self.frame = scored + 1
         out = self._observation(state)
         for i, side in enumerate(keys.SIDES):
-            out[keys.reward(side)] = outcome.reward[:, i : i + 1]
+            out[side].set(keys.REWARD, result.reward[:, i : i + 1])
         out[keys.TERMINATED] = terminated
         out[keys.TRUNCATED] = truncated & ~terminated
         out[keys.DONE] = terminated | truncated
@@ -334,7 +362,7 @@ class TrackingEnv(EnvBase):
         assist = self.assist if self.assist is not None and self.assist.active else None
         steps = self.config.reset_hold_s / self.step_dt
         hold = hold_share(self.steps, ~self.attempt, steps)
-        holds = steps > 0 and (not self.host_sees or bool(hold.any()))
+        holds = steps > 0 and (not self.is_host_device or bool(hold.any()))
         if assist is None and not holds:
             return None
         rows = self.bank.object_index[self.motion]
@@ -356,7 +384,7 @@ class TrackingEnv(EnvBase):
         )
 
     def _observation(self, state: TensorDictBase) -> TensorDict:
-        out = {
+        out: dict[str, Any] = {
             keys.JOINT_POS: state[keys.JOINT_POS],
             keys.JOINT_VEL: state[keys.JOINT_VEL],
             keys.JOINT_TARGET: self._target,
@@ -367,4 +395,12 @@ class TrackingEnv(EnvBase):
             keys.FRAME: self.frame.unsqueeze(-1),
             keys.ATTEMPT: self.attempt.unsqueeze(-1),
         }
+        for i, side in enumerate(keys.SIDES):
+            terms = self._reward_terms[i].unbind(0)
+            out[side] = {
+                keys.FAILED: self._failed[:, i : i + 1],
+                keys.REWARD_TERMS: dict(
+                    zip(self.terms.reward_names, terms, strict=True)
+                ),
+            }
         return TensorDict(out, batch_size=self.batch_size)

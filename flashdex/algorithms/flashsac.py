@@ -174,7 +174,7 @@ class FlashSACLearner(ReplayLearner):
             num_envs=example.batch_size[0],
             total_updates=total_updates,
             generator=generator,
-            quiet=keys.ATTEMPT,
+            deterministic_key=keys.ATTEMPT,
         )
         super().__init__(config, agent, generator, ones=("flags",))
         self.codec = RowCodec(bank)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
@@ -14,15 +13,6 @@ from flashdex.geometry.rotation import quat_to_matrix
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One column range of the packed table and the shape it is read back with."""
-
-    start: int
-    stop: int
-    shape: tuple[int, ...]
 
 
 class ReferenceBank(nn.Module):
@@ -62,7 +52,8 @@ class ReferenceBank(nn.Module):
         self, library: MotionLibrary, hands: dict[keys.Side, HandSpec]
     ) -> None:
         super().__init__()
-        self._fields: dict[str, _Field] = {}
+        # Columns of the packed table and the shape they are read back with.
+        self._fields: dict[str, tuple[slice, tuple[int, ...]]] = {}
         frames, motions = library.frames, _plain(library.motions)
         start = motions["start"].long()
         length = motions["length"].long()
@@ -107,7 +98,7 @@ class ReferenceBank(nn.Module):
     @property
     def num_joints(self) -> int:
         """Joints of one hand, wrist included."""
-        return self._fields["joint_pos"].shape[-1]
+        return self._fields["joint_pos"][1][-1]
 
     def at(
         self, motion: Tensor, frame: Tensor, names: tuple[str, ...] = ()
@@ -127,8 +118,8 @@ class ReferenceBank(nn.Module):
         rows = self.table.index_select(0, index.reshape(-1))
         rows = rows.reshape(*index.shape, -1)
         out = {
-            name: rows[..., f.start : f.stop].unflatten(-1, f.shape)
-            for name, f in self._fields.items()
+            name: rows[..., columns].unflatten(-1, shape)
+            for name, (columns, shape) in self._fields.items()
             if not names or name in names
         }
         return TensorDict(out, batch_size=index.shape)
@@ -192,7 +183,7 @@ class ReferenceBank(nn.Module):
         for name, values in columns.items():
             shape = tuple(values.shape[1:])
             width = math.prod(shape)
-            self._fields[name] = _Field(offset, offset + width, shape)
+            self._fields[name] = slice(offset, offset + width), shape
             flat.append(values.reshape(len(values), width))
             offset += width
         return torch.cat(flat, -1).contiguous()

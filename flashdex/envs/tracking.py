@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Size, Tensor
-from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from flashdex import keys
@@ -18,7 +18,7 @@ from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
 from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
 from flashdex.envs.mdp.manager import TermManager
 from flashdex.envs.mdp.resets import ResetDraw, draw_reset, reset_state
-from flashdex.envs.mdp.samplers import SAMPLERS, UnconvertedSampler
+from flashdex.envs.mdp.samplers import SAMPLERS, MotionSampler
 from flashdex.envs.mdp.step import StepResult, TermContext
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.reference import ReferenceBank, stack_hands
@@ -32,13 +32,12 @@ from flashdex.hands.spec import HandSpec
 WORLDS_A_THREAD = 1024
 
 
+FLAGS = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
+
+
 @contextmanager
 def few_threads(num_envs: int) -> Iterator[None]:
-    """Run the block with at most one torch thread for every 1,024 worlds.
-
-    Args:
-        num_envs: worlds of the tensors inside.
-    """
+    """Run the block with at most one torch thread for every 1,024 worlds."""
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, min(before, num_envs // WORLDS_A_THREAD)))
     try:
@@ -56,8 +55,7 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
         slots: object slots of a world.
         links: links of a hand.
     """
-    n = num_envs
-    whole = torch.int64
+    n, whole = num_envs, torch.int64
     leaves = {
         keys.JOINT_POS: Unbounded(Size((n, 2, joints))),
         keys.JOINT_VEL: Unbounded(Size((n, 2, joints))),
@@ -70,45 +68,6 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
         keys.ATTEMPT: Binary(1, Size((n, 1)), dtype=torch.bool),
     }
     return Composite(leaves, shape=(n,))
-
-
-def _by_side(num_envs: int, leaves: Callable[[], dict[str, TensorSpec]]) -> Composite:
-    shape = (num_envs,)
-    sides = {side: Composite(leaves(), shape=shape) for side in keys.SIDES}
-    return Composite(sides, shape=shape)
-
-
-def action_spec(num_envs: int, joints: int) -> Composite:
-    """Actions of both hands in [-1, 1], (N, J) each."""
-    shape = Size((num_envs, joints))
-    return _by_side(num_envs, lambda: {keys.ACTION: Bounded(-1.0, 1.0, shape)})
-
-
-def reward_spec(num_envs: int) -> Composite:
-    """Rewards of both hands, (N, 1) each."""
-    return _by_side(num_envs, lambda: {keys.REWARD: Unbounded(Size((num_envs, 1)))})
-
-
-def scored_spec(num_envs: int, names: list[str]) -> Composite:
-    """What a step says of each hand: failed, and the raw value of each reward."""
-    shape = Size((num_envs, 1))
-
-    def leaves() -> dict[str, TensorSpec]:
-        terms = {name: Unbounded(shape) for name in names}
-        return {
-            keys.FAILED: Binary(1, shape, dtype=torch.bool),
-            keys.REWARD_TERMS: Composite(terms, shape=(num_envs,)),
-        }
-
-    return _by_side(num_envs, leaves)
-
-
-def done_spec(num_envs: int) -> Composite:
-    """Flags at the root, (N, 1) each."""
-    n = num_envs
-    names = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-    flags = {name: Binary(1, Size((n, 1)), dtype=torch.bool) for name in names}
-    return Composite(flags, shape=(n,))
 
 
 class TrackingEnv(EnvBase):
@@ -167,8 +126,12 @@ class TrackingEnv(EnvBase):
         self._score: Callable[..., tuple[StepResult, Tensor]] = self.terms
         if config.compile:
             self._score = torch.compile(self.terms.__call__, fullgraph=True)
-        self.sampler = SAMPLERS[config.sampler](bank.num_motions, device=device)
-        self.attempt_sampler = UnconvertedSampler(bank.num_motions, device=device)
+        self.sampler, self.attempt_sampler = (
+            MotionSampler(
+                bank.num_motions, converted_weight=SAMPLERS[name], device=device
+            )
+            for name in (config.sampler, "unconverted")
+        )
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
         scale = [config.wrist_pos_scale] * 3 + [config.wrist_rot_scale] * 3
         self._wrist_scale = torch.tensor(scale, device=device)
@@ -203,13 +166,19 @@ class TrackingEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, joints = self.num_envs, self.joint_range.shape[1]
-        links = self.hands["left"].num_links
-        spec = state_spec(n, joints, self.bank.num_slots, links)
-        spec.update(scored_spec(n, self.terms.reward_names))
-        self.observation_spec = spec
-        self.action_spec = action_spec(n, joints)
-        self.reward_spec = reward_spec(n)
-        self.full_done_spec = done_spec(n)
+        one = Size((n, 1))
+        state = state_spec(n, joints, self.bank.num_slots, self.hands["left"].num_links)
+        actions, rewards = Composite(shape=(n,)), Composite(shape=(n,))
+        for side in keys.SIDES:
+            actions[keys.action(side)] = Bounded(-1.0, 1.0, Size((n, joints)))
+            rewards[keys.reward(side)] = Unbounded(one)
+            state[keys.failed(side)] = Binary(1, one, dtype=torch.bool)
+            for name in self.terms.reward_names:
+                state[keys.reward_term(side, name)] = Unbounded(one)
+        flags = {name: Binary(1, one, dtype=torch.bool) for name in FLAGS}
+        self.observation_spec, self.action_spec = state, actions
+        self.reward_spec = rewards
+        self.full_done_spec = Composite(flags, shape=(n,))
 
     @property
     def last_step(self) -> StepResult:
@@ -256,10 +225,7 @@ class TrackingEnv(EnvBase):
             State and flags of all worlds, batch (N,).
         """
         with few_threads(self.num_envs):
-            out = self._reset_worlds(mask)
-        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.zeros_like(mask).unsqueeze(-1)
-        return out
+            return self._reset_worlds(mask)
 
     def _reset_worlds(self, mask: Tensor) -> TensorDict:
         draw = self._draw()
@@ -283,7 +249,10 @@ class TrackingEnv(EnvBase):
         self._contact[ids] = code
         self._failed = self._failed & ~mask.unsqueeze(-1)
         self._reward_terms = torch.where(mask[:, None], 0.0, self._reward_terms)
-        return self._observation(state)
+        out = self._observation(state)
+        for name in FLAGS:
+            out[name] = torch.zeros_like(mask).unsqueeze(-1)
+        return out
 
     def _draw(self) -> ResetDraw:
         motion = self.forced_motion
@@ -324,14 +293,15 @@ class TrackingEnv(EnvBase):
             steps=self.steps,
         )
         self._last_step, self._failed = result, result.failed
-        self._reward_terms = result.stacked_terms()
+        terms = torch.stack(list(result.reward_terms.values()))
+        self._reward_terms = terms.permute(2, 0, 1).unsqueeze(-1)
         terminated = result.failed.any(-1, keepdim=True)
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
         self.frame = scored + 1
         out = self._observation(state)
         for i, side in enumerate(keys.SIDES):
-            out[side].set(keys.REWARD, result.reward[:, i : i + 1])
+            out[keys.reward(side)] = result.reward[:, i : i + 1]
         out[keys.TERMINATED] = terminated
         out[keys.TRUNCATED] = truncated & ~terminated
         out[keys.DONE] = terminated | truncated

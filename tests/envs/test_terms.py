@@ -28,7 +28,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 OWN = {
     "rewards": {"slow": {"_target_": "my_terms.slow_object", "scale": 0.05}},
     "terminations": {"lost": {"_target_": "my_terms.object_lost", "distance": 0.01}},
-    "transforms": {"height": {"_target_": "my_terms.ObjectHeight"}},
+    "transforms": {"height": {"_target_": "my_terms.object_height"}},
 }
 
 

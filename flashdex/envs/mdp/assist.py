@@ -168,14 +168,9 @@ class AssistEpoch:
         terminated: Tensor,
         vector_steps: int,
     ) -> None:
-        """Take in one vector step of ``env``; at the end of an epoch let it fade.
+        """Take in a vector step of ``env``; at the end of an epoch let its assist fade.
 
-        Args:
-            env: its assist may be None; then nothing happens.
-            result: rewards and masks of the step.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-            vector_steps: of the run, this one included.
+        ``vector_steps`` counts those of the run, this one included.
         """
         if env.assist is None:
             return
@@ -187,14 +182,7 @@ class AssistEpoch:
     def add(
         self, result: StepResult, assisted: Tensor, done: Tensor, terminated: Tensor
     ) -> None:
-        """Take in one judged vector step.
-
-        Args:
-            result: rewards and masks of the step.
-            assisted: worlds that count, (N,) bool.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-        """
+        """Take in a vector step; the worlds ``assisted`` count, (N,) bool."""
         counts = result.active & assisted.unsqueeze(-1)
         terms = torch.nan_to_num(torch.stack(list(result.reward_terms.values())))
         sums = torch.where(counts, terms, 0.0).sum((1, 2))

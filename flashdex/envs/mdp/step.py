@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -119,8 +118,3 @@ class StepResult:
     active: Tensor
     motion: Tensor
     frame: Tensor
-
-    def stacked_terms(self) -> Tensor:
-        """Raw values of the rewards by hand, (2, K, N, 1)."""
-        terms = torch.stack(list(self.reward_terms.values()))
-        return terms.permute(2, 0, 1).unsqueeze(-1)

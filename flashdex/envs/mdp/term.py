@@ -44,12 +44,12 @@ class Term:
     """One registered part of an environment and what it declares.
 
     Attributes:
-        kind: where recipes name it.
-        name: by which recipes name it.
+        kind: mapping of a recipe in which it is named.
+        name: by which it is named.
         make: the decorated function or class.
         about: what it is, one paragraph.
         options: dataclass of its options; a reward's begin with its weight.
-        inputs: from a step to the function's arguments; None is the step itself.
+        inputs: from what the function reads to its arguments; None passes it as it is.
         needs_object: zero where the hand has no object.
         gate: mean that the assist waits for.
         off: off unless a recipe turns it on.
@@ -78,12 +78,7 @@ class Term:
         return self.make.__module__.startswith("flashdex.")
 
     def bind(self, context: Any, options: Mapping[str, Any]) -> Callable[[Any], Any]:
-        """Return the term as a function of a step.
-
-        Args:
-            context: what a class is made from.
-            options: values of all options.
-        """
+        """Return the term as a function of a step; a class is made from ``context``."""
         make, inputs = self.make, self.inputs
         if isinstance(make, type):
             return make(context, **options)
@@ -92,80 +87,31 @@ class Term:
         return lambda step: make(*inputs(step), **options)
 
 
-def reward(
-    name: str = "",
-    *,
-    weight: float = 1.0,
-    inputs: Callable[[Any], tuple[Any, ...]] | None = None,
-    needs_object: bool = False,
-    gate: Gate | None = None,
-    off: bool = False,
-    on_failure: bool = False,
-) -> Callable[[M], M]:
+def reward(name: str = "", *, weight: float = 1.0, **declared: Any) -> Callable[[M], M]:
     """Register a reward: a step to one number a world and hand, (N, 2).
 
     Args:
         name: in recipes and logs; that of the function when empty.
         weight: listed weight, of which each hand gets half; may be a `number(...)`.
-        inputs: see `Term`, also for what follows.
-        needs_object: pay nothing where the hand has no object.
-        gate: mean that the assist waits for.
-        off: off unless a recipe turns it on.
-        on_failure: reads the failures of the step and is paid whole.
-
-    Example:
-        >>> @reward("spin", weight=0.1, needs_object=True)
-        ... def spin_exp(step, *, scale: float = number(1.0, above=0)):
-        ...     '''Slow objects.
-        ...
-        ...     Args:
-        ...         scale: Steepness, s/rad.
-        ...     '''
-        ...     return (-scale * step.own_vel[..., 3:].norm(dim=-1)).exp()
+        declared: fields of `Term`.
     """
-    return _register(
-        *("rewards", name, weight),
-        inputs=inputs,
-        needs_object=needs_object,
-        gate=gate,
-        off=off,
-        on_failure=on_failure,
-    )
+    return _register("rewards", name, weight, **declared)
 
 
-def termination(
-    name: str = "",
-    *,
-    inputs: Callable[[Any], tuple[Any, ...]] | None = None,
-    needs_object: bool = False,
-    off: bool = False,
-    in_evaluation: bool = False,
-    sums: Gate | None = None,
-) -> Callable[[M], M]:
+def termination(name: str = "", **declared: Any) -> Callable[[M], M]:
     """Register a termination: a step to the hands that failed, (N, 2) bool.
 
-    Hands without a part in the motion never fail. Arguments are those of `Term`.
+    Hands without a part in the motion never fail. ``declared`` are fields of `Term`.
     """
-    return _register(
-        *("terminations", name),
-        inputs=inputs,
-        needs_object=needs_object,
-        off=off,
-        in_evaluation=in_evaluation,
-        sums=sums,
-    )
+    return _register("terminations", name, **declared)
 
 
-def observation(
-    name: str = "", *, needs_object: bool = False, off: bool = False
-) -> Callable[[M], M]:
-    """Register a class of observation, a `Block`. Arguments are those of `Term`."""
+def observation(name: str = "", **declared: Any) -> Callable[[M], M]:
+    """Register an observation: an assembled state to features, (N, 2, D).
 
-    def add(make: M) -> M:
-        make.needs_object = needs_object  # type: ignore[attr-defined]
-        return _register("transforms", name, needs_object=needs_object, off=off)(make)
-
-    return add
+    A function of a TensorDict or a `Block`. ``declared`` are fields of `Term`.
+    """
+    return _register("transforms", name, **declared)
 
 
 def _register(
@@ -249,28 +195,19 @@ def default_mapping(kind: Kind) -> dict[str, dict[str, Any] | None]:
 
 
 def allow(*packages: str) -> None:
-    """Let recipes name terms of other packages, which are then imported and run.
-
-    Args:
-        packages: importable names, `my_package` or `my_package.rewards`.
-    """
+    """Let recipes name terms of other packages, which are then imported and run."""
     _ALLOWED.update(packages)
 
 
 def find_term(kind: Kind, name: str, options: Mapping[str, Any]) -> Term:
-    """Return the term that an entry of a recipe means.
-
-    Args:
-        kind: which mapping the entry stands in.
-        name: its name.
-        options: its options; `_target_` names a term of an allowed package.
+    """Return the term of a name, or of the `_target_` among its options.
 
     Raises:
         FlashdexError: there is none, or its package is not allowed.
     """
-    known = registry(kind)
     if _TARGET in options:
         return _import_term(kind, str(options[_TARGET]))
+    known = registry(kind)
     if name not in known:
         raise UnknownNameError(name, known, where=f"env.{kind}")
     return known[name]
@@ -303,15 +240,7 @@ def _import_term(kind: Kind, target: str) -> Term:
 def terms_of(
     kind: Kind, mapping: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, tuple[Term, dict[str, Any]]]:
-    """Return the terms that a recipe's mapping has on, with the values of all options.
-
-    Args:
-        kind: of the mapping.
-        mapping: name to options (missing ones take their default), or None = off.
-
-    Raises:
-        FlashdexError: a name is unknown or its package not allowed.
-    """
+    """Return the terms that a recipe has on, with the values of all their options."""
     found = {}
     for name, options in mapping.items():
         term = find_term(kind, name, options or {})

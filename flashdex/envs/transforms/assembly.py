@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 from flashdex import keys
 from flashdex.envs.mdp.term import terms_of
 from flashdex.envs.reference import ReferenceBank, gather_own
-from flashdex.envs.transforms.base import BlockContext, StateTransform
+from flashdex.envs.transforms.base import BlockContext, StateTransform, make_block
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 
@@ -143,19 +143,14 @@ def make_transforms(
     kinematics = HandKinematics(hands)
     context = TrackingContext(bank, kinematics, reference_offset=reference_offset)
     blocks = [
-        term.make(BlockContext(name, bank, hands, reference_offset), **options)
+        make_block(term, BlockContext(name, bank, hands, reference_offset), options)
         for name, (term, options) in terms_of("transforms", mapping).items()
     ]
     return [context, *blocks, ConcatBlocks()]
 
 
 def assemble(transforms: list[Transform], td: TensorDictBase) -> TensorDictBase:
-    """Run transforms on a shallow copy, so that nothing leaks into the caller's td.
-
-    Args:
-        transforms: in data-flow order.
-        td: compact state, batch (N,).
-    """
+    """Run transforms in order on a shallow copy of a compact state, batch (N,)."""
     td = td.copy()
     for transform in transforms:
         td = transform(td)
@@ -195,20 +190,12 @@ class Assembly:
             self._call = torch.compile(self.pure, fullgraph=True, backend=backend)
 
     def __call__(self, state: TensorDictBase) -> TensorDict:
-        """Observation, group mask and, where there is one, future window, (N,).
-
-        Args:
-            state: compact state, batch (N,); it is left alone.
-        """
+        """Observation, group mask and, where there is one, future window, (N,)."""
         shown = self._call({key: state.get(key) for key in keys.STATE})
         return TensorDict(shown, batch_size=state.batch_size)
 
     def pure(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The same on plain tensors.
-
-        Args:
-            state: entries of ``keys.STATE``, (N, ...) each.
-        """
+        """The same on the plain tensors of ``keys.STATE``, (N, ...) each."""
         td = TensorDict(state, batch_size=state[keys.MOTION].shape[:1])
         for transform in self.transforms:
             for key, value in transform.assemble(td).items():

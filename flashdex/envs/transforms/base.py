@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +13,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
+from flashdex.envs.mdp.term import Term
 from flashdex.envs.reference import ReferenceBank
 from flashdex.geometry.rotation import quat_rotate_inverse
 from flashdex.hands.spec import HandSpec
@@ -120,6 +122,39 @@ class Block(StateTransform):
             mask = mask & td[keys.OWN, "present"]
         values = torch.where(mask, values, torch.zeros_like(values))
         return {(keys.BLOCKS, self.name): values[:, self.hands].flatten(1)}
+
+
+class FunctionBlock(Block):
+    """A block whose features are those of a registered function.
+
+    Args:
+        context: what it is made from.
+        term: the function, and what it declares.
+        options: values of its options.
+    """
+
+    def __init__(
+        self, context: BlockContext, term: Term, options: dict[str, Any]
+    ) -> None:
+        super().__init__(context)
+        self.needs_object = term.needs_object
+        self._features = term.bind(context, options)
+
+    def features(self, td: TensorDictBase) -> Tensor:
+        """See the function."""
+        return self._features(td)
+
+
+def make_block(
+    term: Term, context: BlockContext, options: dict[str, Any]
+) -> StateTransform:
+    """Build the transform of an observation that a recipe names."""
+    if not isinstance(term.make, type):
+        return FunctionBlock(context, term, options)
+    block = term.make(context, **options)
+    if term.needs_object:
+        block.needs_object = True
+    return block
 
 
 def own_object(td: TensorDictBase, *names: str) -> list[Tensor]:

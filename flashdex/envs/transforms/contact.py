@@ -17,7 +17,6 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.mdp.term import observation
-from flashdex.envs.transforms.base import Block
 from flashdex.geometry.rotation import (
     quat_conj,
     quat_mul,
@@ -79,11 +78,13 @@ def decode_contact(code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return direction, value[..., 3:4] * _LOG_MAX, value[..., 4:] * POINT_RANGE
 
 
+@observation(inputs=lambda td: (td[keys.KIN], td[keys.CONTACT]), needs_object=True)
 def contact(kin: TensorDictBase, code: Tensor) -> Tensor:
-    """Contact wrench and point of each link in the wrist frame, (N, 2, 11 L).
+    """Contact wrench and contact point of each link, in the wrist frame.
 
-    Force and torque about the link origin as (unit vector * log(1 + n), log(1 + n)),
-    then the point relative to the palm; zeros without contact.
+    (N, 2, 11 L): force and torque about the link origin as
+    (unit vector * log(1 + n), log(1 + n)), then the point relative to the palm; zeros
+    without contact.
 
     Args:
         kin: forward kinematics.
@@ -108,12 +109,3 @@ def contact(kin: TensorDictBase, code: Tensor) -> Tensor:
         point,
     ]
     return torch.cat(parts, -1).flatten(-2)
-
-
-@observation("contact", needs_object=True)
-class Contact(Block):
-    """Contact wrench and contact point of each link, in the wrist frame."""
-
-    def features(self, td: TensorDictBase) -> Tensor:
-        """See ``contact``."""
-        return contact(td[keys.KIN], td[keys.CONTACT])

@@ -11,17 +11,30 @@ from flashdex.envs.mdp.term import observation
 from flashdex.envs.transforms.base import (
     ANGVEL_SCALE,
     LINVEL_SCALE,
-    Block,
     own_object,
     positive_quat,
 )
 from flashdex.geometry.rotation import quat_conj, quat_mul, quat_rotate_inverse
 
 
+@observation(
+    inputs=lambda td: (td[keys.KIN], *own_object(td, "pos", "quat", "vel")),
+    needs_object=True,
+)
 def object_state(
     kin: TensorDictBase, own_pos: Tensor, own_quat: Tensor, own_vel: Tensor
 ) -> Tensor:
-    """Own object's pose and velocity in the wrist frame, (N, 2, 13)."""
+    """Own object's pose and velocity in the wrist frame.
+
+    Args:
+        kin: forward kinematics.
+        own_pos: own object, world, m, (N, 2, 3).
+        own_quat: (N, 2, 4).
+        own_vel: (N, 2, 6).
+
+    Returns:
+        (N, 2, 13).
+    """
     quat = kin["wrist_quat"]
     parts = [
         quat_rotate_inverse(quat, own_pos - kin["wrist_pos"]),
@@ -30,12 +43,3 @@ def object_state(
         quat_rotate_inverse(quat, own_vel[..., 3:]) * ANGVEL_SCALE,
     ]
     return torch.cat(parts, -1)
-
-
-@observation("object_state", needs_object=True)
-class ObjectState(Block):
-    """Own object's pose and velocity in the wrist frame."""
-
-    def features(self, td: TensorDictBase) -> Tensor:
-        """See ``object_state``."""
-        return object_state(td[keys.KIN], *own_object(td, "pos", "quat", "vel"))

@@ -12,15 +12,17 @@ from flashdex.envs.transforms.base import (
     ANGVEL_SCALE,
     JOINT_VEL_SCALE,
     LINVEL_SCALE,
-    Block,
     to_wrist,
 )
 
+_READS = (keys.KIN, keys.JOINT_POS, keys.JOINT_VEL, keys.JOINT_TARGET)
 
+
+@observation(inputs=lambda td: tuple(td[key] for key in _READS))
 def proprioception(
     kin: TensorDictBase, joint_pos: Tensor, joint_vel: Tensor, joint_target: Tensor
 ) -> Tensor:
-    """Palm pose, wrist velocity, joints, fingertips, target error; (N, 2, 61 + ...).
+    """Palm pose, velocities, joints, fingertips, target error.
 
     Args:
         kin: forward kinematics, batch (N,).
@@ -46,13 +48,3 @@ def proprioception(
         joint_target - joint_pos,
     ]
     return torch.cat(parts, -1)
-
-
-@observation("proprioception")
-class Proprioception(Block):
-    """Palm pose, velocities, joints, fingertips, target error."""
-
-    def features(self, td: TensorDictBase) -> Tensor:
-        """See ``proprioception``."""
-        joints = (td[k] for k in (keys.JOINT_POS, keys.JOINT_VEL, keys.JOINT_TARGET))
-        return proprioception(td[keys.KIN], *joints)

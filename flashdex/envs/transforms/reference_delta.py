@@ -69,5 +69,5 @@ class ReferenceDelta(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``reference_delta``."""
-        own = own_object(td, "pos", "quat")
-        return reference_delta(td[keys.KIN], td[keys.REF], *own, self.links)
+        pos, quat = own_object(td, "pos", "quat")
+        return reference_delta(td[keys.KIN], td[keys.REF], pos, quat, self.links)

@@ -85,8 +85,8 @@ class SurfaceDistance(Block):
 
     def features(self, td: TensorDictBase) -> Tensor:
         """See ``fingertip_distance``."""
-        own = own_object(td, "pos", "quat", "row")
+        pos, quat, row = own_object(td, "pos", "quat", "row")
         distance, normal = fingertip_distance(
-            td[keys.KIN], *own, self.sdf, self.tip_radius
+            td[keys.KIN], pos, quat, row, self.sdf, self.tip_radius
         )
         return torch.cat([distance, normal.flatten(-2)], -1)

@@ -168,7 +168,7 @@ def _make_block(
         row = _push(learner, td, action)
         if row is not None:
             found.append(row)
-        td = env.restart(td["next", keys.DONE].squeeze(-1))
+        td = env.reset_worlds(td["next", keys.DONE].squeeze(-1))
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
     rows = rows[chosen]

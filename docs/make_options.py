@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.envs.config import EnvConfig, GymConfig
-from flashdex.envs.mdp.options import REGISTRY, NoOptions
-from flashdex.envs.transforms import blocks
+from flashdex.envs.mdp.term import KINDS, registry
 from flashdex.recipe import GymRecipe, LoopConfig, Recipe
 from flashdex.recipe.schema import Expectation, RunRecipe
 
@@ -43,8 +42,10 @@ def plain(text: str) -> str:
 
 
 def field_docs(cls: type) -> dict[str, str]:
-    """Return the docstring below each field of a dataclass, in one line each."""
-    found: dict[str, str] = {}
+    """Return what is said of each field of a dataclass, in one line each."""
+    found = {f.name: plain(f.metadata.get("text", "")) for f in dataclasses.fields(cls)}
+    if all(found.values()):  # the options of a term; else the docstrings below fields
+        return found
     for base in cls.__bases__:
         if dataclasses.is_dataclass(base):
             found |= field_docs(base)
@@ -112,7 +113,7 @@ def has_own_section(cls: type, name: str, hint: Any) -> bool:
     """Whether a field is a group of options."""
     kinds = [hint, *typing.get_args(hint)]
     is_group = any(dataclasses.is_dataclass(kind) for kind in kinds)
-    return is_group or (cls is EnvConfig and name in REGISTRY)
+    return is_group or (cls is EnvConfig and name in KINDS)
 
 
 def section(path: str, cls: type, *, about: str = "") -> list[str]:
@@ -131,7 +132,7 @@ def section(path: str, cls: type, *, about: str = "") -> list[str]:
         for kind in (hint, *typing.get_args(hint)):
             if dataclasses.is_dataclass(kind) and kind is not Expectation:
                 lines += section(where, typing.cast(type, kind))
-        if cls is EnvConfig and name in REGISTRY:
+        if cls is EnvConfig and name in KINDS:
             lines += named_section(where, name)
     return lines
 
@@ -139,12 +140,8 @@ def section(path: str, cls: type, *, about: str = "") -> list[str]:
 def named_section(path: str, kind: str) -> list[str]:
     """Return one subsection for each registered part of a kind."""
     lines = [f"## {path}", "", NAMED_NOTES[kind], ""]
-    for name, cls in REGISTRY[typing.cast(Any, kind)].items():
-        about = ""
-        if cls is NoOptions:
-            block = getattr(blocks, name.title().replace("_", ""))
-            about = inspect.cleandoc(block.__doc__).split("\n\n")[0]
-        part = section(f"{path}.{name}", cls, about=about)
+    for name, term in registry(typing.cast(Any, kind)).items():
+        part = section(f"{path}.{name}", term.options, about=term.about)
         lines += ["#" + part[0], *part[1:]]
     return lines
 

@@ -47,6 +47,7 @@ GROUP_MASK = "group_mask"  # (N, G) bool, group takes part in the motion
 # -- actions, rewards, flags --------------------------------------------------
 ACTION = "action"
 REWARD = "reward"
+REWARD_TERMS = "reward_terms"  # by hand: raw value of each reward, (N, 1) by name
 FAILED = "failed"
 STEPS = "steps"  # (N, 1) window length of an n-step row
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
@@ -60,6 +61,11 @@ def action(side: Side) -> tuple[str, str]:
 def reward(side: Side) -> tuple[str, str]:
     """Key of the reward of one hand, (N, 1)."""
     return (side, REWARD)
+
+
+def reward_term(side: Side, name: str) -> tuple[str, str, str]:
+    """Key of the raw value of one reward for one hand, (N, 1)."""
+    return (side, REWARD_TERMS, name)
 
 
 def failed(side: Side) -> tuple[str, str]:

@@ -74,7 +74,7 @@ class TurnTaker:
                 td.set(keys.action(side), action[:, i])
             after = env.step(td).get("next")
             targets.append(after[keys.JOINT_TARGET])
-            td = env.restart(after[keys.DONE].squeeze(-1))
+            td = env.reset_worlds(after[keys.DONE].squeeze(-1))
         return targets, now(env.device) - begin
 
     @torch.no_grad()

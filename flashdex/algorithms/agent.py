@@ -34,7 +34,7 @@ class FlashSACAgent:
         total_updates: horizon of the learning-rate schedule.
         generator: source of the exploration and policy noise; its device is that of
             everything else.
-        quiet: key of the worlds that never explore, see `FlashPolicy`.
+        deterministic_key: key of the worlds that never explore, see `FlashPolicy`.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class FlashSACAgent:
         num_envs: int,
         total_updates: int,
         generator: torch.Generator,
-        quiet: NestedKey | None = None,
+        deterministic_key: NestedKey | None = None,
     ) -> None:
         self.config, self.device = config, generator.device
         number = 1 if groups is None else len(groups)
@@ -94,7 +94,9 @@ class FlashSACAgent:
             clock=config.noise_clock,
             generator=generator,
         ).to(self.device)
-        self.policy = FlashPolicy(self.actor, groups=groups, noise=noise, quiet=quiet)
+        self.policy = FlashPolicy(
+            self.actor, groups=groups, noise=noise, deterministic_key=deterministic_key
+        )
 
     def update(self, batch: TensorDictBase) -> TensorDict:
         """One FlashSAC update on a sampled batch; returns its metrics."""

@@ -17,7 +17,7 @@ from flashdex.algorithms.base import snapshot
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.transforms.compiled import Assembly
+from flashdex.envs.transforms.assembly import Assembly
 from flashdex.modules.layers import restore_generator
 from flashdex.replay.buffer import STAGES, HostBuffer, RowBuffer, check_pinning
 from flashdex.replay.codec import RowCodec, RowPatch, finite_rows
@@ -174,7 +174,7 @@ class FlashSACLearner(ReplayLearner):
             num_envs=example.batch_size[0],
             total_updates=total_updates,
             generator=generator,
-            quiet=keys.ATTEMPT,
+            deterministic_key=keys.ATTEMPT,
         )
         super().__init__(config, agent, generator, ones=("flags",))
         self.codec = RowCodec(bank)

@@ -15,7 +15,7 @@ from flashdex.algorithms.agent import make_encoder
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.transforms.compiled import Assembly
+from flashdex.envs.transforms.assembly import Assembly
 from flashdex.errors import RunError
 from flashdex.modules.gaussian_policy import GaussianPolicy, RunningNorm, ValueNet
 from flashdex.modules.layers import restore_generator

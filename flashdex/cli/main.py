@@ -39,6 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         datefmt="%H:%M:%S",
     )
     try:
+        if getattr(args, "allow", None):
+            from flashdex.envs.mdp.term import allow
+
+            allow(*args.allow)
         return args.run(args)
     except FlashdexError as error:
         if args.debug:
@@ -89,11 +93,21 @@ def make_parser() -> argparse.ArgumentParser:
         "recipe", nargs="?", help="say what memory this recipe needs instead"
     )
     verb.add_argument("overrides", nargs="*", metavar="key=value")
+    _add_allow(verb)
     add("ls", _ls, "list recipes with what they promise, and sources of recordings")
     _add_recipe_verbs(add)
     add_data_verbs(add)
     _add_run_verbs(add)
     return parser
+
+
+def _add_allow(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--allow",
+        action="append",
+        metavar="PACKAGE",
+        help="let the recipe name terms of this package of yours, which runs its code",
+    )
 
 
 def _add_recipe_verbs(
@@ -105,6 +119,7 @@ def _add_recipe_verbs(
 
     verb = add("validate", _validate, "find every mistake in recipes")
     verb.add_argument("paths", nargs="+", metavar="PATH", help="recipe or folder")
+    _add_allow(verb)
 
 
 def _add_run_verbs(
@@ -121,10 +136,12 @@ def _add_run_verbs(
     verb.add_argument(
         "--cfg", choices=["job"], help="print the composed recipe and stop"
     )
+    _add_allow(verb)
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
     verb.add_argument("run_dir", type=Path, metavar="RUN")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
+    _add_allow(verb)
 
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
     verb.add_argument("run_dir", type=Path, metavar="RUN")

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from flashdex.envs.mdp.assist import AssistConfig
-from flashdex.envs.mdp.options import default_mapping
 from flashdex.envs.mdp.resets import ResetNoise
+from flashdex.envs.mdp.term import default_mapping
 from flashdex.system.fields import number
 
-
-def _default_transforms() -> dict[str, dict[str, Any] | None]:
-    return default_mapping("transforms")
-
-
-def _default_rewards() -> dict[str, dict[str, Any] | None]:
-    return default_mapping("rewards")
-
-
-def _default_terminations() -> dict[str, dict[str, Any] | None]:
-    return default_mapping("terminations")
+Terms = dict[str, dict[str, Any] | None]
+"""Terms by name, with the options that differ from their defaults; null is off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,16 +57,16 @@ class EnvConfig:
     attempt_share: float = number(0.125, low=0, high=1)
     """Share of worlds that always start at frame 0, without assist and noise, with
     the deterministic policy; their rollouts are the attempts that are scored."""
-    transforms: dict[str, dict[str, Any] | None] = dataclasses.field(
-        default_factory=_default_transforms
+    transforms: Terms = dataclasses.field(
+        default_factory=partial(default_mapping, "transforms")
     )
     """Observation parts by name; null removes one."""
-    rewards: dict[str, dict[str, Any] | None] = dataclasses.field(
-        default_factory=_default_rewards
+    rewards: Terms = dataclasses.field(
+        default_factory=partial(default_mapping, "rewards")
     )
     """Reward terms by name; null removes one."""
-    terminations: dict[str, dict[str, Any] | None] = dataclasses.field(
-        default_factory=_default_terminations
+    terminations: Terms = dataclasses.field(
+        default_factory=partial(default_mapping, "terminations")
     )
     """Failure terminations by name; null removes one."""
     assist: AssistConfig | None = dataclasses.field(default_factory=AssistConfig)

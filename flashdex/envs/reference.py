@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
@@ -14,15 +13,6 @@ from flashdex.geometry.rotation import quat_to_matrix
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One column range of the packed table and the shape it is read back with."""
-
-    start: int
-    stop: int
-    shape: tuple[int, ...]
 
 
 class ReferenceBank(nn.Module):
@@ -62,7 +52,8 @@ class ReferenceBank(nn.Module):
         self, library: MotionLibrary, hands: dict[keys.Side, HandSpec]
     ) -> None:
         super().__init__()
-        self._fields: dict[str, _Field] = {}
+        # Columns of the packed table and the shape they are read back with.
+        self._fields: dict[str, tuple[slice, tuple[int, ...]]] = {}
         frames, motions = library.frames, _plain(library.motions)
         start = motions["start"].long()
         length = motions["length"].long()
@@ -84,11 +75,8 @@ class ReferenceBank(nn.Module):
         own = torch.gather(rows, 1, slot.clamp_min(0)).clamp_min(0)
         self.register_buffer("hand_object", own)
         objects = _plain(library.objects)
-        self.register_buffer("points", objects["points"].float())
-        self.register_buffer("radius", objects["radius"].float())
-        self.register_buffer("mass", objects["mass"].float())
-        self.register_buffer("inertia", objects["inertia"].float())
-        self.register_buffer("com", objects["com"].float())
+        for name in ("points", "radius", "mass", "inertia", "com"):
+            self.register_buffer(name, objects[name].float())
         self.sdf = SdfGrid(
             objects["sdf"].float(),
             objects["sdf_origin"].float(),
@@ -110,7 +98,7 @@ class ReferenceBank(nn.Module):
     @property
     def num_joints(self) -> int:
         """Joints of one hand, wrist included."""
-        return self._fields["joint_pos"].shape[-1]
+        return self._fields["joint_pos"][1][-1]
 
     def at(
         self, motion: Tensor, frame: Tensor, names: tuple[str, ...] = ()
@@ -130,8 +118,8 @@ class ReferenceBank(nn.Module):
         rows = self.table.index_select(0, index.reshape(-1))
         rows = rows.reshape(*index.shape, -1)
         out = {
-            name: rows[..., f.start : f.stop].unflatten(-1, f.shape)
-            for name, f in self._fields.items()
+            name: rows[..., columns].unflatten(-1, shape)
+            for name, (columns, shape) in self._fields.items()
             if not names or name in names
         }
         return TensorDict(out, batch_size=index.shape)
@@ -163,12 +151,8 @@ class ReferenceBank(nn.Module):
     def _columns(
         self, frames: TensorDict, slot: Tensor, hands: dict[keys.Side, HandSpec]
     ) -> dict[str, Tensor]:
-        take = slot.clamp_min(0)
-
         def own(name: str) -> Tensor:
-            values = frames[name].float()
-            index = take.unsqueeze(-1).expand(-1, -1, values.shape[-1])
-            return torch.gather(values, 1, index)
+            return gather_own(frames[name].float(), slot.clamp_min(0))
 
         tips = list(keys.TIP_KEYPOINTS)
         mapped = [[k for _, k in hands[s].keypoint_links] for s in keys.SIDES]
@@ -176,20 +160,13 @@ class ReferenceBank(nn.Module):
         pick = pick[None, :, :, None].expand(frames.shape[0], -1, -1, 3)
         keypoints = frames["keypoints"].float()
         keypoint_vel = frames["keypoint_linvel"].float()
-        per_hand = {
-            name: frames[name].float()
-            for name in (
-                "joint_pos",
-                "joint_vel",
-                "wrist_pos",
-                "wrist_quat",
-                "wrist_linvel",
-                "wrist_angvel",
-                "tip_dist",
-            )
-        }
+        per_hand = (
+            *("joint_pos", "joint_vel", "wrist_pos", "wrist_quat"),
+            *("wrist_linvel", "wrist_angvel", "tip_dist"),
+        )
+        objects = ("object_pos", "object_quat", "object_linvel", "object_angvel")
         return {
-            **per_hand,
+            **{name: frames[name].float() for name in per_hand},
             "tip_pos": keypoints[:, :, tips],
             "tip_linvel": keypoint_vel[:, :, tips],
             "link_pos": torch.gather(keypoints, 2, pick),
@@ -198,10 +175,7 @@ class ReferenceBank(nn.Module):
             "own_quat": own("object_quat"),
             "own_linvel": own("object_linvel"),
             "own_angvel": own("object_angvel"),
-            "object_pos": frames["object_pos"].float(),
-            "object_quat": frames["object_quat"].float(),
-            "object_linvel": frames["object_linvel"].float(),
-            "object_angvel": frames["object_angvel"].float(),
+            **{name: frames[name].float() for name in objects},
         }
 
     def _pack(self, columns: dict[str, Tensor]) -> Tensor:
@@ -209,10 +183,22 @@ class ReferenceBank(nn.Module):
         for name, values in columns.items():
             shape = tuple(values.shape[1:])
             width = math.prod(shape)
-            self._fields[name] = _Field(offset, offset + width, shape)
+            self._fields[name] = slice(offset, offset + width), shape
             flat.append(values.reshape(len(values), width))
             offset += width
         return torch.cat(flat, -1).contiguous()
+
+
+def gather_own(values: Tensor, slot: Tensor) -> Tensor:
+    """Pick each hand's own object: (N, O, C) by slots (N, 2) to (N, 2, C)."""
+    index = slot.unsqueeze(-1).expand(-1, -1, values.shape[-1])
+    return torch.gather(values, 1, index)
+
+
+def stack_hands(hands: dict[keys.Side, HandSpec], name: str) -> Tensor:
+    """Numbers of both hands' specs, left first, (2, ...)."""
+    values = [torch.as_tensor(getattr(hands[side], name)) for side in keys.SIDES]
+    return torch.stack(values).float()
 
 
 def _plain(mapped: TensorDict) -> dict[str, Tensor]:

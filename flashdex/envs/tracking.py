@@ -16,13 +16,14 @@ from flashdex import keys
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
 from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
-from flashdex.envs.mdp.managers import Judge, Outcome, Scoring, StepInfo
+from flashdex.envs.mdp.manager import TermManager
 from flashdex.envs.mdp.resets import ResetDraw, draw_reset, reset_state
-from flashdex.envs.mdp.samplers import SAMPLERS, UnconvertedSampler
+from flashdex.envs.mdp.samplers import SAMPLERS, MotionSampler
+from flashdex.envs.mdp.step import StepResult, TermContext
 from flashdex.envs.physics.base import Physics
-from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.wrench import ObjectWrench, hold_share
-from flashdex.envs.transforms.contact_code import CODE_WIDTH, contact_code
+from flashdex.envs.transforms.contact import CODE_WIDTH, contact_code
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
 
@@ -31,13 +32,12 @@ from flashdex.hands.spec import HandSpec
 WORLDS_A_THREAD = 1024
 
 
+FLAGS = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
+
+
 @contextmanager
 def few_threads(num_envs: int) -> Iterator[None]:
-    """Run the block with at most one torch thread for every 1,024 worlds.
-
-    Args:
-        num_envs: worlds of the tensors inside.
-    """
+    """Run the block with at most one torch thread for every 1,024 worlds."""
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, min(before, num_envs // WORLDS_A_THREAD)))
     try:
@@ -55,8 +55,7 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
         slots: object slots of a world.
         links: links of a hand.
     """
-    n = num_envs
-    whole = torch.int64
+    n, whole = num_envs, torch.int64
     leaves = {
         keys.JOINT_POS: Unbounded(Size((n, 2, joints))),
         keys.JOINT_VEL: Unbounded(Size((n, 2, joints))),
@@ -71,40 +70,13 @@ def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
     return Composite(leaves, shape=(n,))
 
 
-def action_spec(num_envs: int, joints: int) -> Composite:
-    """Actions of both hands in [-1, 1], (N, J) each."""
-    n = num_envs
-    sides = {
-        s: Composite({keys.ACTION: Bounded(-1.0, 1.0, Size((n, joints)))}, shape=(n,))
-        for s in keys.SIDES
-    }
-    return Composite(sides, shape=(n,))
-
-
-def reward_spec(num_envs: int) -> Composite:
-    """Rewards of both hands, (N, 1) each."""
-    n = num_envs
-    sides = {
-        s: Composite({keys.REWARD: Unbounded(Size((n, 1)))}, shape=(n,))
-        for s in keys.SIDES
-    }
-    return Composite(sides, shape=(n,))
-
-
-def done_spec(num_envs: int) -> Composite:
-    """Flags at the root, (N, 1) each."""
-    n = num_envs
-    names = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-    flags = {name: Binary(1, Size((n, 1)), dtype=torch.bool) for name in names}
-    return Composite(flags, shape=(n,))
-
-
 class TrackingEnv(EnvBase):
-    """Batched, batch-locked, with partial resets; emits the compact state only.
+    """Batched, batch-locked, with partial resets; emits the compact state.
 
     Worlds ``0 .. num_attempts - 1`` always start at frame 0 without assist and without
     reset noise: their finished episodes are attempts. Actions are
-    ``("left", "action")`` and ``("right", "action")`` in [-1, 1]; rewards are per hand;
+    ``("left", "action")`` and ``("right", "action")`` in [-1, 1]; per hand are also
+    ``reward``, ``failed`` and the raw ``reward_terms`` by name (0 after a reset);
     ``done``, ``terminated`` and ``truncated`` stand at the root only.
 
     Args:
@@ -136,26 +108,30 @@ class TrackingEnv(EnvBase):
         self.physics, self.bank, self.hands, self.config = physics, bank, hands, config
         self.step_dt = step_dt
         # Looking at a flag is free on the cpu; a device would have to be waited for.
-        self.host_sees = device.type == "cpu"
+        self.is_host_device = device.type == "cpu"
         self.group_map, self.num_envs = {side: [side] for side in keys.SIDES}, n
         self.num_attempts = n if evaluation else round(config.attempt_share * n)
         self.attempt = torch.arange(n, device=device) < self.num_attempts
         self.kinematics = HandKinematics(hands).to(device)
-        ranges = [torch.as_tensor(hands[s].joint_range) for s in keys.SIDES]
-        self.joint_range = torch.stack(ranges).float().to(device)
+        self.joint_range = stack_hands(hands, "joint_range").to(device)
         self.lead_s = (torch.zeros(()) if lead_s is None else lead_s).to(device)
-        self.judge = Judge(
-            bank,
-            hands,
-            config,
-            step_dt=step_dt,
-            num_envs=n,
-            lead_s=self.lead_s,
-            evaluation=evaluation,
+        context = TermContext(
+            *(bank, n, step_dt, self.lead_s, self.joint_range),
+            tip_radius=stack_hands(hands, "tip_radius").to(device),
         )
-        self._score = Scoring(self.judge, self.kinematics, compile=config.compile)
-        self.sampler = SAMPLERS[config.sampler](bank.num_motions, device=device)
-        self.attempt_sampler = UnconvertedSampler(bank.num_motions, device=device)
+        self.terms = TermManager(
+            context, config, self.kinematics, evaluation=evaluation
+        )
+        # Some five hundred small operations; compiled they are a few kernels.
+        self._score: Callable[..., tuple[StepResult, Tensor]] = self.terms
+        if config.compile:
+            self._score = torch.compile(self.terms.__call__, fullgraph=True)
+        self.sampler, self.attempt_sampler = (
+            MotionSampler(
+                bank.num_motions, converted_weight=SAMPLERS[name], device=device
+            )
+            for name in (config.sampler, "unconverted")
+        )
         self._alpha = lowpass_alpha(config.wrist_lowpass_hz, step_dt)
         scale = [config.wrist_pos_scale] * 3 + [config.wrist_rot_scale] * 3
         self._wrist_scale = torch.tensor(scale, device=device)
@@ -173,7 +149,11 @@ class TrackingEnv(EnvBase):
         self._target = torch.zeros(n, 2, self.joint_range.shape[1], device=device)
         shape = (n, 2, hands["left"].num_links, CODE_WIDTH)
         self._contact = torch.zeros(shape, dtype=torch.int8, device=device)
-        self.info: StepInfo | None = None
+        # Of the last step, by hand.
+        names = len(self.terms.reward_names)
+        self._reward_terms = torch.zeros(2, names, n, 1, device=device)
+        self._failed = torch.zeros(n, 2, dtype=torch.bool, device=device)
+        self._last_step: StepResult | None = None
         self._make_specs()
         self.generator = torch.Generator(device)
         self.set_seed(seed)
@@ -186,17 +166,25 @@ class TrackingEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, joints = self.num_envs, self.joint_range.shape[1]
-        links = self.hands["left"].num_links
-        self.observation_spec = state_spec(n, joints, self.bank.num_slots, links)
-        self.action_spec = action_spec(n, joints)
-        self.reward_spec = reward_spec(n)
-        self.full_done_spec = done_spec(n)
+        one = Size((n, 1))
+        state = state_spec(n, joints, self.bank.num_slots, self.hands["left"].num_links)
+        actions, rewards = Composite(shape=(n,)), Composite(shape=(n,))
+        for side in keys.SIDES:
+            actions[keys.action(side)] = Bounded(-1.0, 1.0, Size((n, joints)))
+            rewards[keys.reward(side)] = Unbounded(one)
+            state[keys.failed(side)] = Binary(1, one, dtype=torch.bool)
+            for name in self.terms.reward_names:
+                state[keys.reward_term(side, name)] = Unbounded(one)
+        flags = {name: Binary(1, one, dtype=torch.bool) for name in FLAGS}
+        self.observation_spec, self.action_spec = state, actions
+        self.reward_spec = rewards
+        self.full_done_spec = Composite(flags, shape=(n,))
 
     @property
-    def last_outcome(self) -> Outcome:
-        """How the last step was judged."""
-        assert self.info is not None, "no step yet"
-        return self.info.outcome
+    def last_step(self) -> StepResult:
+        """What the last step was worth."""
+        assert self._last_step is not None, "no step yet"
+        return self._last_step
 
     def put_action(self, td: TensorDictBase, action: Tensor) -> None:
         """Write the actions of both hands, (N, 2, J), from any device into ``td``."""
@@ -222,9 +210,9 @@ class TrackingEnv(EnvBase):
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is not None:
             mask = asked.reshape(self.num_envs)
-        return self.restart(mask)
+        return self.reset_worlds(mask)
 
-    def restart(self, mask: Tensor) -> TensorDict:
+    def reset_worlds(self, mask: Tensor) -> TensorDict:
         """Begin new episodes in some worlds; what the coming step starts from.
 
         The same as ``reset`` of the worlds marked in ``_reset``, without the checks
@@ -237,12 +225,9 @@ class TrackingEnv(EnvBase):
             State and flags of all worlds, batch (N,).
         """
         with few_threads(self.num_envs):
-            out = self._restart(mask)
-        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.zeros_like(mask).unsqueeze(-1)
-        return out
+            return self._reset_worlds(mask)
 
-    def _restart(self, mask: Tensor) -> TensorDict:
+    def _reset_worlds(self, mask: Tensor) -> TensorDict:
         draw = self._draw()
         start = reset_state(draw, self.bank, self.joint_range)
         self.physics.reset(mask, draw.motion, **start)
@@ -253,16 +238,21 @@ class TrackingEnv(EnvBase):
         rows = mask[:, None, None]
         self._filter = torch.where(rows, 0.0, self._filter)
         self._target = torch.where(rows, start["joint_pos"], self._target)
-        self.judge.reset(mask)
+        self.terms.reset(mask)
         state = self.physics.state()
         self._contact = self._contact.clone()
-        ids = mask.nonzero().squeeze(-1) if self.host_sees else slice(None)
+        ids = mask.nonzero().squeeze(-1) if self.is_host_device else slice(None)
         kin = self.kinematics(state[keys.JOINT_POS][ids], None)
         code = contact_code(state[keys.CONTACT][ids], kin)
-        if not self.host_sees:
+        if not self.is_host_device:
             code = torch.where(rows.unsqueeze(-1), code, self._contact)
         self._contact[ids] = code
-        return self._observation(state)
+        self._failed = self._failed & ~mask.unsqueeze(-1)
+        self._reward_terms = torch.where(mask[:, None], 0.0, self._reward_terms)
+        out = self._observation(state)
+        for name in FLAGS:
+            out[name] = torch.zeros_like(mask).unsqueeze(-1)
+        return out
 
     def _draw(self) -> ResetDraw:
         motion = self.forced_motion
@@ -292,18 +282,26 @@ class TrackingEnv(EnvBase):
         self._act(action, ref)
         state = self.physics.state()
         self.steps = self.steps + 1
-        outcome, self._contact = self._score(
-            state, action, ref, self._target, self.motion, self.steps
-        )
         scored = self.frame
-        self.info = StepInfo(outcome, scored, self.motion)
-        terminated = outcome.blame.any(-1, keepdim=True)
+        result, self._contact = self._score(
+            state,
+            ref,
+            action=action,
+            target=self._target,
+            motion=self.motion,
+            frame=scored,
+            steps=self.steps,
+        )
+        self._last_step, self._failed = result, result.failed
+        terms = torch.stack(list(result.reward_terms.values()))
+        self._reward_terms = terms.permute(2, 0, 1).unsqueeze(-1)
+        terminated = result.failed.any(-1, keepdim=True)
         ended = scored >= self.bank.length[self.motion] - 1
         truncated = (ended | (self.steps >= self._max_steps)).unsqueeze(-1)
         self.frame = scored + 1
         out = self._observation(state)
         for i, side in enumerate(keys.SIDES):
-            out[keys.reward(side)] = outcome.reward[:, i : i + 1]
+            out[keys.reward(side)] = result.reward[:, i : i + 1]
         out[keys.TERMINATED] = terminated
         out[keys.TRUNCATED] = truncated & ~terminated
         out[keys.DONE] = terminated | truncated
@@ -334,7 +332,7 @@ class TrackingEnv(EnvBase):
         assist = self.assist if self.assist is not None and self.assist.active else None
         steps = self.config.reset_hold_s / self.step_dt
         hold = hold_share(self.steps, ~self.attempt, steps)
-        holds = steps > 0 and (not self.host_sees or bool(hold.any()))
+        holds = steps > 0 and (not self.is_host_device or bool(hold.any()))
         if assist is None and not holds:
             return None
         rows = self.bank.object_index[self.motion]
@@ -356,7 +354,7 @@ class TrackingEnv(EnvBase):
         )
 
     def _observation(self, state: TensorDictBase) -> TensorDict:
-        out = {
+        out: dict[str, Any] = {
             keys.JOINT_POS: state[keys.JOINT_POS],
             keys.JOINT_VEL: state[keys.JOINT_VEL],
             keys.JOINT_TARGET: self._target,
@@ -367,4 +365,12 @@ class TrackingEnv(EnvBase):
             keys.FRAME: self.frame.unsqueeze(-1),
             keys.ATTEMPT: self.attempt.unsqueeze(-1),
         }
+        for i, side in enumerate(keys.SIDES):
+            terms = self._reward_terms[i].unbind(0)
+            out[side] = {
+                keys.FAILED: self._failed[:, i : i + 1],
+                keys.REWARD_TERMS: dict(
+                    zip(self.terms.reward_names, terms, strict=True)
+                ),
+            }
         return TensorDict(out, batch_size=self.batch_size)

@@ -3,7 +3,6 @@
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import EnvConfig, GymConfig
 from flashdex.envs.mdp.assist import AssistConfig
-from flashdex.envs.mdp.options import REWARDS, TERMINATIONS, TRANSFORMS, build_options
 from flashdex.envs.mdp.resets import ResetNoise
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.metrics.criteria_table import CRITERIA, CriterionName
@@ -24,9 +23,6 @@ from flashdex.recipe.tasks import GymRecipe, expect_kind, require_motions, task_
 
 __all__ = [
     "CRITERIA",
-    "REWARDS",
-    "TERMINATIONS",
-    "TRANSFORMS",
     "AlgoConfig",
     "AssistConfig",
     "CriterionName",
@@ -42,7 +38,6 @@ __all__ = [
     "ResetNoise",
     "RunRecipe",
     "TrainConfig",
-    "build_options",
     "compose",
     "compose_runs",
     "copy_recipe",

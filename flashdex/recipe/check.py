@@ -12,14 +12,14 @@ import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-from flashdex.envs.mdp.options import REGISTRY, Kind
-from flashdex.errors import RecipeError, nearest
+from flashdex.envs.mdp.term import KINDS, Kind, find_term, registry
+from flashdex.errors import FlashdexError, RecipeError, nearest
 from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.tasks import split_foreign
 from flashdex.system.fields import range_problem
 
 R = TypeVar("R", bound=RunRecipe)
-_NAMED: dict[str, Kind] = {f"env.{kind}": kind for kind in REGISTRY}
+_NAMED: dict[str, Kind] = {f"env.{kind}": kind for kind in KINDS}
 # Stand-ins for required values that are absent; the recipe is refused anyway.
 _STAND_INS: dict[type, Any] = {int: 1, str: "", float: 1.0}
 
@@ -121,17 +121,26 @@ def _read_named(
     if not isinstance(data, Mapping):
         problems.append(f"{path}: expected names and options, found {data!r}")
         return {}
-    known = REGISTRY[kind]
+    known = registry(kind)
     result: dict[str, Any] = {}
     for name, options in data.items():
-        where = _join(path, name)
-        if name not in known:
+        where, target = _join(path, name), {}
+        is_shipped = name in known and known[name].is_shipped
+        if isinstance(options, Mapping) and not is_shipped:
+            target = {k: v for k, v in options.items() if k == "_target_"}
+            options = {k: v for k, v in options.items() if k != "_target_"}
+        if name not in known and not target:
             problems.append(_unknown(where, kind[:-1], str(name), known))
-        elif options is None:
-            result[name] = None
-        else:
-            part = _read_dataclass(known[name], options, where, problems)
-            result[name] = dataclasses.asdict(part)
+            continue
+        try:
+            term = find_term(kind, name, target)
+        except FlashdexError as error:
+            problems.append(f"{where}: unknown {kind[:-1]}. {error}")
+            continue
+        result[name] = None
+        if options is not None:
+            part = _read_dataclass(term.options, options, where, problems)
+            result[name] = target | dataclasses.asdict(part)
     return result
 
 

@@ -354,7 +354,7 @@ def _merge_files(
         with hydra.initialize_config_dir(str(dirs[0]), version_base="1.3"):
             config = hydra.compose(path.stem, overrides=[search, *choices])
         OmegaConf.set_struct(config, False)
-        merged = OmegaConf.merge(OmegaConf.create(kind_of(config).base), config)
+        merged = OmegaConf.merge(OmegaConf.create(kind_of(config).make_base()), config)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         problems.append(f"{path.name}: {' '.join(str(error).split())}")
         return OmegaConf.create({})

@@ -13,7 +13,8 @@ import yaml
 import flashdex.hands
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
-from flashdex.envs.mdp.options import REGISTRY, default_mapping
+from flashdex.envs.mdp.term import KINDS as TERM_KINDS
+from flashdex.envs.mdp.term import default_mapping, registry, terms_of
 from flashdex.errors import FlashdexError, nearest
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
@@ -139,14 +140,14 @@ def _env(recipe: Recipe) -> list[str]:
         problems.append(
             "env.attempt_share: 1 leaves no world to explore; use less than 1"
         )
-    has_object_term = any(
-        env.rewards.get(name) is not None for name in ("object_points", "object_pose")
-    )
-    if env.terminations.get("early_reset") is not None and not has_object_term:
-        problems.append(
-            "env.terminations.early_reset: it sums the object term, but the rewards "
-            "object_points and object_pose are both off; turn one on"
-        )
+    gates = {term.gate for term, _ in terms_of("rewards", env.rewards).values()}
+    for name, (term, _) in terms_of("terminations", env.terminations).items():
+        if term.sums is not None and term.sums not in gates:
+            known = [n for n, t in registry("rewards").items() if t.gate == term.sums]
+            problems.append(
+                f"env.terminations.{name}: it sums the object term, but the rewards "
+                f"{' and '.join(known)} are all off; turn one on"
+            )
     return problems
 
 
@@ -263,7 +264,7 @@ class Kind:
     """Its schema."""
     find_conflicts: Callable[[Any], list[str]]
     """Says what does not fit together in one."""
-    base: dict[str, Any]
+    make_base: Callable[[], dict[str, Any]]
     """What its files are merged onto: all named parts with no option set."""
 
 
@@ -272,9 +273,9 @@ KINDS: dict[str, Kind] = {
     DEFAULT_TASK: Kind(
         root=Recipe,
         find_conflicts=find_conflicts,
-        base={"env": {kind: default_mapping(kind) for kind in REGISTRY}},
+        make_base=lambda: {"env": {k: default_mapping(k) for k in TERM_KINDS}},
     ),
-    "gym": Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, base={}),
+    "gym": Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, make_base=dict),
 }
 
 

@@ -58,7 +58,7 @@ class AttemptRing:
     def __init__(self, env: TrackingEnv, *, look_every: int | None = None) -> None:
         self.env, self.count = env, env.num_attempts
         if look_every is None:
-            look_every = 1 if env.host_sees else LOOK_EVERY
+            look_every = 1 if env.is_host_device else LOOK_EVERY
         self.look_every = look_every
         self.size = env.max_episode_steps + look_every
         self.written = 0  # vector steps recorded
@@ -83,17 +83,16 @@ class AttemptRing:
         Returns:
             Episodes that are now known to have ended.
         """
-        info, raw = self.env.info, self.env.physics.raw()
-        assert info is not None
+        result, raw = self.env.last_step, self.env.physics.raw()
         self._write("qpos", raw.qpos)
         self._write("qvel", raw.qvel)
         self._write("ctrl", raw.ctrl)
         self._write("wrench", raw.wrench)
         self._write("action", action)
-        self._write("motion", info.motion)
-        self._write("frame", info.frame)
+        self._write("motion", result.motion)
+        self._write("frame", result.frame)
         self._write("done", done)
-        for name, blame in info.outcome.causes.items():
+        for name, blame in result.terminations.items():
             self._write(f"cause/{name}", blame)
         self.written += 1
         self._env_steps.append(env_steps)

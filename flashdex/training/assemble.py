@@ -119,7 +119,7 @@ def _make_judging(
     recipe, provenance = bench.recipe, _provenance(bench)
     made_by = versions(recipe.physics.engine, env.device)
     where = recipe.train.judge
-    if where == "inline" or (where == "auto" and env.host_sees):
+    if where == "inline" or (where == "auto" and env.is_host_device):
         scenes = env.physics.scenes
         maker = bench.attempt_maker(scenes, made_by=made_by, provenance=provenance)
         return JudgeHere(ledger, maker)

@@ -25,7 +25,7 @@ from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.envs.transforms.build import make_transforms
+from flashdex.envs.transforms.assembly import make_transforms
 from flashdex.errors import DemoError, FlashdexError, LibraryError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand

@@ -77,7 +77,7 @@ def _roll(
         for episode in ring.step(action, done, env_steps):
             if episode.motion not in found:  # short motions begin again
                 found[episode.motion] = maker.make(episode)
-        td = env.restart(done.squeeze(-1))
+        td = env.reset_worlds(done.squeeze(-1))
         ring.begin()
     return [found[r] for r in rows.tolist()]
 

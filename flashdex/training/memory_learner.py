@@ -16,8 +16,7 @@ from flashdex.algorithms.hand_groups import HandGroups
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import state_spec
-from flashdex.envs.transforms.build import make_transforms
-from flashdex.envs.transforms.compiled import Assembly
+from flashdex.envs.transforms.assembly import Assembly, make_transforms
 from flashdex.hands.spec import HandSpec
 from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
 from flashdex.modules.layers import warm_up_statistics

@@ -15,7 +15,7 @@ from torch import Tensor
 from flashdex import keys
 
 if TYPE_CHECKING:
-    from flashdex.envs.mdp.managers import Outcome
+    from flashdex.envs.mdp.step import StepResult
 
 Names = tuple[str, ...]
 
@@ -62,27 +62,27 @@ class RunningStats:
             sums, counts = known[0] + sums, known[1] + counts
         self._tables[tuple(names)] = sums, counts
 
-    def add_step(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
+    def add_step(self, result: StepResult, done: Tensor, terminated: Tensor) -> None:
         """Take in one judged vector step.
 
         Args:
-            outcome: rewards and errors.
+            result: rewards and errors.
             done: (N, 1) bool.
             terminated: (N, 1) bool.
         """
         self._steps += 1
-        values = {f"reward/{{side}}/{k}": v for k, v in outcome.terms.items()}
-        values["reward/{side}/total"] = outcome.reward
-        values["error/{side}/object_pos_mm"] = outcome.object_pos_error * 1e3
-        degrees = torch.rad2deg(outcome.object_rot_error)
+        values = {f"reward/{{side}}/{k}": v for k, v in result.reward_terms.items()}
+        values["reward/{side}/total"] = result.reward
+        values["error/{side}/object_pos_mm"] = result.object_pos_error * 1e3
+        degrees = torch.rad2deg(result.object_rot_error)
         values["error/{side}/object_rot_deg"] = degrees
         names = [name.format(side=side) for name in values for side in keys.SIDES]
         found = torch.nan_to_num(torch.stack(list(values.values())))  # (K, N, 2)
-        active = outcome.active
+        active = result.active
         sums = torch.where(active, found, 0.0).sum(1)
         counts = active.sum(0).expand_as(sums)
         self.add(names, sums.flatten(), counts.flatten())
-        self.add_ends(done, terminated, outcome.causes)
+        self.add_ends(done, terminated, result.terminations)
 
     def add_ends(
         self, done: Tensor, terminated: Tensor, causes: dict[str, Tensor] | None = None

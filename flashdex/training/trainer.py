@@ -275,10 +275,10 @@ class Trainer:
         self.start, self.replay = start, replay
         self.judging, self.attempts = judging, AttemptRing(env)
         self.stats = RunningStats()
-        self.assist_epoch = AssistEpoch()
+        self.assist_epoch = AssistEpoch(env.terms.gates)
         self.guard = GradientGuard()
         # A device takes its work in one line: a second thread would only stand by it.
-        self.alongside = Alongside(threaded=recipe.train.overlap and env.host_sees)
+        self.alongside = Alongside(threaded=recipe.train.overlap and env.is_host_device)
         self.stop = StopSignals()
         self.env_steps = start.env_steps
         self.vector_steps = 0
@@ -361,16 +361,16 @@ class Trainer:
             self._remember(td, action)
         if not self.learner.is_off_policy:
             self._learn()
-        judged = (self.env.last_outcome, done, terminated)
+        judged = (self.env.last_step, done, terminated)
         self.stats.add_step(*judged)
         self.assist_epoch.step(self.env, *judged, self.vector_steps)
         with self.stats.time("reset"):
             return self._advance(td, done)
 
     def _advance(self, td: TensorDictBase, done: Tensor) -> TensorDictBase:
-        if self.env.host_sees and not done.any():
+        if self.env.is_host_device and not done.any():
             return step_mdp(td)
-        td = self.env.restart(done.squeeze(-1))
+        td = self.env.reset_worlds(done.squeeze(-1))
         self.attempts.begin()
         return td
 

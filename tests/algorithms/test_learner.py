@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from flashdex import keys
-from flashdex.envs.transforms.base import assemble
+from flashdex.envs.transforms.assembly import assemble
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
 
 GROUPS = ("per_hand", "unified")

@@ -9,7 +9,7 @@ import torch
 
 from flashdex import keys
 from flashdex.algorithms.config import PPOConfig
-from flashdex.envs.transforms.base import assemble
+from flashdex.envs.transforms.assembly import assemble
 from flashdex.errors import RunError
 from flashdex.recipe import MotionsConfig, TrainConfig
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint

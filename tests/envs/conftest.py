@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from flashdex import keys
-from flashdex.envs.transforms.contact_code import encode_contact
+from flashdex.envs.transforms.contact import encode_contact
 
 FINGERS = keys.FINGERS
 

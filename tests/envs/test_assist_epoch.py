@@ -6,7 +6,10 @@ import pytest
 import torch
 
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.mdp.managers import Outcome
+from flashdex.envs.mdp.step import StepResult
+
+GATES = {"object_points": "task", "wrist_pos": "imitation"}
+GATES |= {"behaviour_cloning": "cloning"}
 
 
 def judged(active, object_points, cloning):
@@ -15,12 +18,13 @@ def judged(active, object_points, cloning):
         "object_points": torch.tensor(object_points) * active,
         "behaviour_cloning": torch.tensor(cloning),
     }
-    zeros = torch.zeros(active.shape)
-    return Outcome(zeros, terms, active & False, {}, zeros, zeros, active)
+    zeros, rows = torch.zeros(active.shape), torch.zeros(len(active))
+    errors = zeros, zeros
+    return StepResult(zeros, terms, active & False, {}, *errors, active, rows, rows)
 
 
 def test_a_perfect_one_handed_world_reaches_one():
-    epoch = AssistEpoch()
+    epoch = AssistEpoch(GATES)
     outcome = judged([[False, True]], [[0.0, 1.0]], [[1.0, 0.2]])
     none = torch.zeros(1, 1, dtype=torch.bool)
     epoch.add(outcome, torch.tensor([True]), none, none)
@@ -31,7 +35,7 @@ def test_a_perfect_one_handed_world_reaches_one():
 
 
 def test_attempt_worlds_do_not_count():
-    epoch = AssistEpoch()
+    epoch = AssistEpoch(GATES)
     outcome = judged(
         [[True, True], [True, True]], [[0.8, 0.6], [0.0, 0.0]], [[0.5] * 2] * 2
     )

@@ -8,9 +8,12 @@ from torch.nn.functional import normalize
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
-from flashdex.envs.transforms.base import assemble
-from flashdex.envs.transforms.build import make_transforms
-from flashdex.envs.transforms.compiled import OUTPUTS, Assembly
+from flashdex.envs.transforms.assembly import (
+    OUTPUTS,
+    Assembly,
+    assemble,
+    make_transforms,
+)
 
 
 @pytest.fixture(scope="module")

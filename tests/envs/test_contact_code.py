@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from flashdex.envs.transforms.contact_code import (
+from flashdex.envs.transforms.contact import (
     MAX_FORCE,
     POINT_RANGE,
     decode_contact,

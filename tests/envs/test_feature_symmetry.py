@@ -9,7 +9,14 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from flashdex import keys
-from flashdex.envs.transforms import features
+from flashdex.envs.reference import gather_own
+from flashdex.envs.transforms.contact import contact
+from flashdex.envs.transforms.future_window import future_window
+from flashdex.envs.transforms.object_points import object_points
+from flashdex.envs.transforms.object_state import object_state
+from flashdex.envs.transforms.proprioception import proprioception
+from flashdex.envs.transforms.reference_delta import reference_delta
+from flashdex.envs.transforms.surface_distance import fingertip_distance
 from flashdex.geometry.rotation import quat_mul, quat_rotate, quat_to_matrix
 from flashdex.hands.kinematics import HandKinematics
 
@@ -48,8 +55,8 @@ def scene(make_state, bank, hands):
     state = make_state(8, seed=3)
     motion, frame = state[keys.MOTION][:, 0], state[keys.FRAME][:, 0]
     slot = bank.hand_slot[motion]
-    pose = features.gather_own(state[keys.OBJECT_POSE], slot)
-    vel = features.gather_own(state[keys.OBJECT_VEL], slot)
+    pose = gather_own(state[keys.OBJECT_POSE], slot)
+    vel = gather_own(state[keys.OBJECT_VEL], slot)
     kin = HandKinematics(hands)(state[keys.JOINT_POS], state[keys.JOINT_VEL])
     ref, window = bank.at(motion, frame), bank.window(motion, frame, 10)
     own = {
@@ -71,18 +78,18 @@ def test_wrist_frame_features_ignore_where_the_scene_is(scene, bank, hands):
     def observe(kin, ref, window, own):
         vel = torch.cat([own["lin"], own["ang"]], -1)
         pos, quat = own["pos"], own["quat"]
-        distance = features.fingertip_distance(kin, pos, quat, rows, bank.sdf, radius)
+        distance = fingertip_distance(kin, pos, quat, rows, bank.sdf, radius)
         joints = [state[k] for k in (keys.JOINT_POS, keys.JOINT_VEL, keys.JOINT_TARGET)]
         return {
             # palm pose and velocity and the link deltas are in the world by design
-            "proprioception": features.proprioception(kin, *joints)[..., 13:],
-            "delta": features.reference_delta(kin, ref, pos, quat, links)[..., -7:],
-            "object": features.object_state(kin, pos, quat, vel),
-            "points": features.object_points(kin, ref, pos, quat, bank.points[rows]),
+            "proprioception": proprioception(kin, *joints)[..., 13:],
+            "delta": reference_delta(kin, ref, pos, quat, links)[..., -7:],
+            "object": object_state(kin, pos, quat, vel),
+            "points": object_points(kin, ref, pos, quat, bank.points[rows]),
             "distance": distance[0],
             "normal": distance[1],
-            "contact": features.contact(kin, state[keys.CONTACT]),
-            "window": features.future_window(kin, *window, pos, quat, vel),
+            "contact": contact(kin, state[keys.CONTACT]),
+            "window": future_window(kin, *window, pos, quat, vel),
         }
 
     before = observe(kin, ref, window, own)
@@ -108,7 +115,7 @@ def test_window_is_neutral_on_the_reference(bank):
     motion, frame = torch.full((20,), 2), torch.arange(10, 30)
     state = at_reference(bank, motion, frame)
     kin, *own = state
-    window = features.future_window(kin, *bank.window(motion, frame, 10), *own)
+    window = future_window(kin, *bank.window(motion, frame, 10), *own)
     now = window[..., 0]
     neutral = torch.zeros(39)
     neutral[3:9] = neutral[18:24] = torch.tensor([1.0, 0, 0, 0, 1.0, 0])
@@ -120,7 +127,7 @@ def test_window_repeats_the_last_frame(bank):
     last = bank.length[:2] - 1
     motion = torch.arange(2)
     kin, *own = at_reference(bank, motion, last - 2)
-    window = features.future_window(kin, *bank.window(motion, last - 2, 6), *own)
+    window = future_window(kin, *bank.window(motion, last - 2, 6), *own)
     for step in (3, 4, 5):
         assert torch.equal(window[..., step], window[..., 2])
     assert not torch.equal(window[..., 1], window[..., 2])

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
-from flashdex.envs.transforms.build import make_transforms
-from flashdex.envs.transforms.contact_code import decode_contact
+from flashdex.envs.transforms.assembly import make_transforms
+from flashdex.envs.transforms.contact import decode_contact
 
 ROWS = 6
 WIDTHS = {  # a hand; both hands give the widths of method section 6

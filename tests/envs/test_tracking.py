@@ -31,6 +31,12 @@ def act(env, td, value=0.0):
     return env.step(td)
 
 
+def object_sum(env):
+    """The running sum that one termination keeps."""
+    _, early_reset = env.terms.terminations["early_reset"]
+    return early_reset.object_sum
+
+
 @pytest.mark.parametrize("evaluation", [False, True])
 def test_specs(make_env, evaluation):
     check_env_specs(make_env(3, evaluation=evaluation), seed=0)
@@ -104,13 +110,13 @@ def test_partial_reset_touches_only_its_worlds(make_env):
         td = step_mdp(act(env, td, 0.2))
     mask = torch.tensor([[False], [True], [False], [True]])
     before = state_of(td).clone()
-    internals = (env.steps.clone(), env._filter.clone(), env.judge.object_sum.clone())
+    internals = (env.steps.clone(), env._filter.clone(), object_sum(env).clone())
     after = env.reset(td.clone().set("_reset", mask))
     kept = ~mask[:, 0]
     assert same(state_of(after)[kept], before[kept])
     assert (env.steps[mask[:, 0]] == 0).all()
     for now, old in zip(
-        (env.steps, env._filter, env.judge.object_sum), internals, strict=True
+        (env.steps, env._filter, object_sum(env)), internals, strict=True
     ):
         assert torch.equal(now[kept], old[kept])
         assert not now[mask[:, 0]].any()
@@ -176,7 +182,7 @@ def test_attempt_worlds_get_no_assist(make_env):
 def test_evaluation_ends_for_sanity_only(make_env):
     env = make_env(3, evaluation=True)
     env.forced_motion = torch.arange(3)
-    assert set(env.judge.terminations) == {"sanity"}
+    assert set(env.terms.terminations) == {"sanity"}
     td = env.reset()
     for _ in range(29):
         td = act(env, td, -1.0)
@@ -185,7 +191,7 @@ def test_evaluation_ends_for_sanity_only(make_env):
     env.physics._qvel[2] = 1e12
     td = act(env, td)
     assert td["next", keys.TERMINATED][:, 0].tolist() == [False, False, True]
-    blame = env.info.outcome.blame
+    blame = env.last_step.failed
     assert blame[2].tolist() == [True, True]
 
 
@@ -203,7 +209,7 @@ def test_failure_terminates_with_blame(make_env, bank):
     after = td["next"]
     assert after[keys.TERMINATED][:, 0].tolist() == [False, True, False]
     assert not after[keys.TRUNCATED].any()
-    assert env.info.outcome.causes["object_dropped"][1].tolist() == [True, False]
+    assert env.last_step.terminations["object_dropped"][1].tolist() == [True, False]
     assert after[keys.reward("left")][1, 0] < -1.6
     assert after[keys.reward("right")][1, 0] > -0.1
     assert after[keys.reward("left")][0, 0] > -0.1
@@ -212,15 +218,17 @@ def test_failure_terminates_with_blame(make_env, bank):
 def test_rewards_are_those_of_the_named_terms(make_env, bank):
     env = make_env(4)
     td = act(env, env.reset(), 0.1)
-    outcome = env.info.outcome
+    result = env.last_step
     total = torch.zeros(4, 2)
-    for name, value in outcome.terms.items():
-        weight = env.config.rewards[name].get("weight", env.judge.weights[name])
+    for name, value in result.reward_terms.items():
+        weight = env.config.rewards[name].get("weight", env.terms.weights[name])
         total += weight * value * (1.0 if name == "failure" else 0.5) / 60
     total *= bank.hand_active[td[keys.MOTION][:, 0]]
     got = torch.cat([td["next", keys.reward(s)] for s in keys.SIDES], -1)
     torch.testing.assert_close(got, total)
-    torch.testing.assert_close(outcome.terms["action_l2"], torch.full((4, 2), 0.01))
+    torch.testing.assert_close(
+        result.reward_terms["action_l2"], torch.full((4, 2), 0.01)
+    )
     idle = ~bank.hand_active[td[keys.MOTION][:, 0]]
     assert not got[idle].any()
 

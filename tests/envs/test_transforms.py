@@ -10,8 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
-from flashdex.envs.transforms.base import assemble
-from flashdex.envs.transforms.build import make_transforms
+from flashdex.envs.transforms.assembly import assemble, make_transforms
 
 BLOCKS = [n for n in EnvConfig().transforms if n != "future_window"]
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from flashdex.envs.config import GymConfig
-from flashdex.envs.mdp.options import REGISTRY
+from flashdex.envs.mdp.term import KINDS, registry
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError, RecipeError, UnknownRecipeError
 from flashdex.hands.gains import GainsPreset
@@ -283,5 +283,7 @@ def test_closed_sets_agree_with_their_owners():
 
 
 def test_every_option_is_documented():
-    for classes in REGISTRY.values():
-        assert all(options.__doc__ for options in classes.values())
+    for term in [term for kind in KINDS for term in registry(kind).values()]:
+        assert term.about
+        for field in dataclasses.fields(term.options):
+            assert field.metadata["text"], f"{term.name}.{field.name}"

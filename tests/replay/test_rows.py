@@ -8,8 +8,7 @@ from tensordict import TensorDict
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
-from flashdex.envs.transforms.base import assemble
-from flashdex.envs.transforms.build import make_transforms
+from flashdex.envs.transforms.assembly import assemble, make_transforms
 from flashdex.replay.codec import RowCodec, row_bytes
 from flashdex.replay.nstep import NStepAssembler
 

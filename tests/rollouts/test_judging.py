@@ -51,7 +51,7 @@ def episodes(bench):
         env.put_action(td, action)
         done = env.step(td)["next", keys.DONE]
         found += ring.step(action, done, step)
-        td = env.restart(done.squeeze(-1))
+        td = env.reset_worlds(done.squeeze(-1))
         ring.begin()
     assert len(found) > 6
     return found, env.physics.scenes

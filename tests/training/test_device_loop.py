@@ -24,7 +24,7 @@ from flashdex.training.trainer import Trainer
 
 def unseen(env: TrackingEnv) -> TrackingEnv:
     """The environment, as if the host had to wait for what it looks at."""
-    env.host_sees = False
+    env.is_host_device = False
     return env
 
 
@@ -83,7 +83,7 @@ def random_steps(env, steps, *, seed=0):
         td = env.step(td)
         yield action, td["next", keys.DONE]
         done = td["next", keys.DONE]
-        td = env.restart(done.squeeze(-1)) if done.any() else step_mdp(td)
+        td = env.reset_worlds(done.squeeze(-1)) if done.any() else step_mdp(td)
 
 
 def test_looking_seldom_finds_the_same_episodes(make_env):
@@ -121,7 +121,7 @@ def test_restart_is_the_reset_of_the_marked_worlds(make_env):
             roots[i] = step_mdp(env.step(action.clone()))
     mask = torch.tensor([True, False, True, False, False])
     asked = roots[0].set("_reset", mask.unsqueeze(-1))
-    by_torchrl, ours = one.reset(asked), two.restart(mask)
+    by_torchrl, ours = one.reset(asked), two.reset_worlds(mask)
     for key in (*keys.STATE, keys.ATTEMPT, keys.DONE):
         assert torch.equal(by_torchrl[key], ours[key]), key
     assert (by_torchrl[keys.FRAME][mask] != roots[1][keys.FRAME][mask]).any()

@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from flashdex import keys
 from flashdex.algorithms.config import PPOConfig
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.mdp.managers import Outcome
+from flashdex.envs.mdp.step import StepResult
 from flashdex.training.guard import GradientGuard, numeric_errors
 from flashdex.training.stats import RunningStats
 
@@ -176,16 +176,20 @@ def outcome_of(seed):
     terms = {"object_points": values[0], "wrist_pos": values[1]}
     active, causes = draw(0.8), {"object": draw(), "wrist": draw()}
     blame = causes["object"] | causes["wrist"]
-    return Outcome(values[2], terms, blame, causes, values[3], values[3], active)
+    errors, rows = (values[3], values[3]), torch.zeros(WORLDS)
+    return StepResult(values[2], terms, blame, causes, *errors, active, rows, rows)
 
 
 def test_statistics_are_those_of_loops_over_worlds_and_hands():
-    stats, epoch = RunningStats(), AssistEpoch()
+    stats, epoch = (
+        RunningStats(),
+        AssistEpoch({"object_points": "task", "wrist_pos": "imitation"}),
+    )
     steps = []
     for seed in range(3):
         outcome = outcome_of(seed)
-        outcome.terms["wrist_pos"][seed, 1] = float("nan")  # counts as 0
-        failed = outcome.blame.any(-1, keepdim=True)
+        outcome.reward_terms["wrist_pos"][seed, 1] = float("nan")  # counts as 0
+        failed = outcome.failed.any(-1, keepdim=True)
         done = failed | (torch.arange(WORLDS) == seed)[:, None]
         assisted = torch.arange(WORLDS) > 1
         steps.append((outcome, done, failed))
@@ -194,7 +198,7 @@ def test_statistics_are_those_of_loops_over_worlds_and_hands():
             epoch.add(outcome, assisted, done, failed)
     found = stats.pop(2.0, WORLDS)
     right = [
-        0.0 if (value := o.terms["wrist_pos"][n, 1].item()) != value else value
+        0.0 if (value := o.reward_terms["wrist_pos"][n, 1].item()) != value else value
         for o, _, _ in steps
         for n in range(WORLDS)
         if o.active[n, 1]
@@ -202,7 +206,9 @@ def test_statistics_are_those_of_loops_over_worlds_and_hands():
     assert found["reward/right/wrist_pos"] == pytest.approx(sum(right) / len(right))
     ended = sum(int(d[n]) for _, d, _ in steps for n in range(WORLDS))
     failed = sum(int(f[n]) for _, _, f in steps for n in range(WORLDS))
-    wrist = sum(int(o.causes["wrist"][n].any()) for o, _, _ in steps for n in range(6))
+    wrist = sum(
+        int(o.terminations["wrist"][n].any()) for o, _, _ in steps for n in range(6)
+    )
     assert found["episode/ends"] == ended
     assert found["episode/completed"] == pytest.approx((ended - failed) / ended)
     assert found["episode/wrist"] == pytest.approx(wrist / ended)
@@ -212,10 +218,10 @@ def test_statistics_are_those_of_loops_over_worlds_and_hands():
 
 
 def check_epoch(epoch, steps):
-    again = AssistEpoch()
+    again = AssistEpoch({"object_points": "task", "wrist_pos": "imitation"})
     again.load_state_dict(epoch.state_dict())
     points = [
-        o.terms["object_points"][n, h].item()
+        o.reward_terms["object_points"][n, h].item()
         for o, _, _ in steps
         for n in range(2, WORLDS)
         for h in range(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,8 @@ from torch import Tensor
 from flashdex.system.fields import number
 
 if TYPE_CHECKING:
-    pass
-    from flashdex.envs.mdp.managers import Outcome
+    from flashdex.envs.mdp.step import StepResult
+    from flashdex.envs.mdp.term import Gate
     from flashdex.envs.tracking import TrackingEnv
 
 
@@ -139,20 +140,19 @@ class AssistSchedule:
         self.epoch, self._changed_at = state["epoch"], state["changed_at"]
 
 
-_TASK = ("object_points", "object_pose")
-_IMITATION = ("wrist_pos", "wrist_rot", "fingertip_pos")
-_CLONING = ("behaviour_cloning",)
-
-
 class AssistEpoch:
     """Collects what decides whether the assist may fade.
 
     Only assisted worlds count: attempt worlds have no assist, so their failures say
     nothing about it. Hands without a part in the motion are left out. What a step adds
     stays on its device; the host waits for it once an epoch.
+
+    Args:
+        gates: the rewards that count, in order, and what for.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gates: Mapping[str, Gate]) -> None:
+        self.gates = gates
         self._clear()
 
     def _clear(self) -> None:
@@ -163,40 +163,28 @@ class AssistEpoch:
     def step(
         self,
         env: TrackingEnv,
-        outcome: Outcome,
+        result: StepResult,
         done: Tensor,
         terminated: Tensor,
         vector_steps: int,
     ) -> None:
-        """Take in one vector step of ``env``; at the end of an epoch let it fade.
+        """Take in a vector step of ``env``; at the end of an epoch let its assist fade.
 
-        Args:
-            env: its assist may be None; then nothing happens.
-            outcome: rewards and masks of the step.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-            vector_steps: of the run, this one included.
+        ``vector_steps`` counts those of the run, this one included.
         """
         if env.assist is None:
             return
-        self.add(outcome, ~env.attempt, done, terminated)
+        self.add(result, ~env.attempt, done, terminated)
         ends = vector_steps % env.assist.config.epoch_steps == 0
         if ends and env.assist.end_epoch(**self.pop()):
             env.redraw_assist()
 
     def add(
-        self, outcome: Outcome, assisted: Tensor, done: Tensor, terminated: Tensor
+        self, result: StepResult, assisted: Tensor, done: Tensor, terminated: Tensor
     ) -> None:
-        """Take in one judged vector step.
-
-        Args:
-            outcome: rewards and masks of the step.
-            assisted: worlds that count, (N,) bool.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-        """
-        counts = outcome.active & assisted.unsqueeze(-1)
-        terms = torch.nan_to_num(torch.stack(list(outcome.terms.values())))
+        """Take in a vector step; the worlds ``assisted`` count, (N,) bool."""
+        counts = result.active & assisted.unsqueeze(-1)
+        terms = torch.nan_to_num(torch.stack(list(result.reward_terms.values())))
         sums = torch.where(counts, terms, 0.0).sum((1, 2))
         numbers = [
             counts.sum(),
@@ -204,7 +192,7 @@ class AssistEpoch:
             (terminated.squeeze(-1) & assisted).sum(),
         ]
         total = torch.cat([sums.double(), torch.stack(numbers).double()])
-        names = tuple(outcome.terms)
+        names = tuple(result.reward_terms)
         if self._totals is not None and names == self._names:
             total = total + self._totals.to(total.device)  # a checkpoint's: on the CPU
         self._names, self._totals = names, total
@@ -220,15 +208,18 @@ class AssistEpoch:
         """Means since the last call, each 0..1: arguments of ``end_epoch``."""
         sums, number, ended, failed = self._read()
 
-        def mean(names: tuple[str, ...]) -> float:
-            found = [sums[n] for n in names if n in sums]
-            count = len(found) * number
-            return sum(found) / count if count else 0.0
+        def found(gate: Gate) -> list[float]:
+            return [sums[n] for n, g in self.gates.items() if g == gate and n in sums]
 
+        def mean(values: list[float]) -> float:
+            count = len(values) * number
+            return sum(values) / count if count else 0.0
+
+        task = next((value for value in found("task") if value), 0.0)
         out = {
-            "task": mean(_TASK[:1]) or mean(_TASK[1:]),
-            "imitation": mean(_IMITATION),
-            "cloning": mean(_CLONING),
+            "task": mean([task]),
+            "imitation": mean(found("imitation")),
+            "cloning": mean(found("cloning")),
             "completion": 1.0 - failed / ended if ended else 1.0,
         }
         self._clear()

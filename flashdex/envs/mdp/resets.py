@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,9 +11,6 @@ from torch import Tensor
 from flashdex.envs.mdp.samplers import start_frames
 from flashdex.envs.reference import ReferenceBank
 from flashdex.system.fields import number
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
@@ -66,14 +62,14 @@ def draw_reset(
     std = noise.finger_range * span
     std[:, :3] = noise.wrist_pos
     std[:, 3:6] = math.radians(noise.wrist_rot_deg)
-    quiet = noiseless[:, None, None]
+    noiseless = noiseless[:, None, None]
     finger_vel = vel[..., 6:] * noise.finger_vel
     return ResetDraw(
         motion=motion,
         frame=frame,
-        pos_noise=torch.where(quiet, 0.0, draw * std),
-        vel_noise=torch.where(quiet, 0.0, vel[..., :6] * noise.wrist_vel),
-        finger_vel=torch.where(quiet, math.nan, finger_vel),
+        pos_noise=torch.where(noiseless, 0.0, draw * std),
+        vel_noise=torch.where(noiseless, 0.0, vel[..., :6] * noise.wrist_vel),
+        finger_vel=torch.where(noiseless, math.nan, finger_vel),
     )
 
 

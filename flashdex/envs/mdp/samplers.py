@@ -6,16 +6,24 @@ import torch
 from torch import Tensor
 
 
-class UniformSampler:
-    """Every motion alike.
+class MotionSampler:
+    """Draws motions; converted ones less often, but never not at all.
 
     Args:
         num_motions: motions in the collection.
+        converted_weight: weight of a converted motion against 1.
         device: where rows are drawn.
     """
 
-    def __init__(self, num_motions: int, *, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        num_motions: int,
+        *,
+        converted_weight: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.weights = torch.ones(num_motions, device=device)
+        self.converted_weight = converted_weight
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Return motion rows, (count,) int64."""
@@ -28,37 +36,12 @@ class UniformSampler:
         return row.clamp_max(len(edges) - 1)
 
     def mark_converted(self, motion: int) -> None:
-        """Conversions change nothing here."""
-
-
-class UnconvertedSampler(UniformSampler):
-    """Converted motions are drawn less often, but never not at all.
-
-    Args:
-        num_motions: motions in the collection.
-        converted_weight: weight of a converted motion against 1.
-        device: where rows are drawn.
-    """
-
-    def __init__(
-        self,
-        num_motions: int,
-        *,
-        converted_weight: float = 0.25,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        super().__init__(num_motions, device=device)
-        self.converted_weight = converted_weight
-
-    def mark_converted(self, motion: int) -> None:
         """Lower the weight of ``motion``."""
         self.weights[motion] = self.converted_weight
 
 
-SAMPLERS: dict[str, type[UniformSampler]] = {
-    "uniform": UniformSampler,
-    "unconverted": UnconvertedSampler,
-}
+# Weight of a converted motion, by the name of the sampler.
+SAMPLERS = {"uniform": 1.0, "unconverted": 0.25}
 
 
 def start_frames(length: Tensor, generator: torch.Generator) -> Tensor:

@@ -1,7 +1,11 @@
-"""Base of the observation transforms: one pure ``assemble`` behind three doors."""
+"""Bases of the observation transforms: one pure ``assemble`` behind three doors."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -9,6 +13,13 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
+from flashdex.envs.mdp.term import Term
+from flashdex.envs.reference import ReferenceBank
+from flashdex.geometry.rotation import quat_rotate_inverse
+from flashdex.hands.spec import HandSpec
+
+# Scales of method section 6 that bring speeds near one.
+LINVEL_SCALE, ANGVEL_SCALE, JOINT_VEL_SCALE = 2.0, 0.25, 0.1
 
 
 class StateTransform(Transform):
@@ -56,14 +67,106 @@ class StateTransform(Transform):
         return observation_spec
 
 
-def assemble(transforms: list[Transform], td: TensorDictBase) -> TensorDictBase:
-    """Run transforms on a shallow copy, so that nothing leaks into the caller's td.
+@dataclass(frozen=True)
+class BlockContext:
+    """What observation transforms are made from.
+
+    Attributes:
+        name: of the block in the recipe.
+        bank: reference frames and object tables.
+        hands: hand specs by side.
+        reference_offset: ``env.reference_offset`` of the recipe.
+    """
+
+    name: str
+    bank: ReferenceBank
+    hands: dict[keys.Side, HandSpec]
+    reference_offset: int
+
+    @property
+    def used_hands(self) -> slice:
+        """Hands that any motion of the collection uses."""
+        # a slice: a list as an index is copied to the device at every call
+        return slice(self.bank.used_hands[0], self.bank.used_hands[-1] + 1)
+
+
+class Block(StateTransform):
+    """A named part of the observation: features of the hands, side by side.
+
+    Subclasses write ``features`` (N, 2, D); hands without a part in the motion and,
+    where ``needs_object`` is set, hands without an object get zeros. A hand that no
+    motion of the collection uses is left out.
 
     Args:
-        transforms: in data-flow order.
-        td: compact state, batch (N,).
+        context: what it is made from.
     """
-    td = td.copy()
-    for transform in transforms:
-        td = transform(td)
-    return td
+
+    needs_object = False
+
+    def __init__(self, context: BlockContext) -> None:
+        super().__init__(
+            in_keys=[keys.KIN, keys.REF, keys.OWN, keys.GROUP_MASK],
+            out_keys=[(keys.BLOCKS, context.name)],
+        )
+        self.name, self.hands = context.name, context.used_hands
+
+    def features(self, td: TensorDictBase) -> Tensor:
+        """Features of both hands, (N, 2, D)."""
+        raise NotImplementedError
+
+    def assemble(self, td: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Mask and flatten the features."""
+        values = self.features(td)
+        mask = td[keys.GROUP_MASK].unsqueeze(-1)
+        if self.needs_object:
+            mask = mask & td[keys.OWN, "present"]
+        values = torch.where(mask, values, torch.zeros_like(values))
+        return {(keys.BLOCKS, self.name): values[:, self.hands].flatten(1)}
+
+
+class FunctionBlock(Block):
+    """A block whose features are those of a registered function.
+
+    Args:
+        context: what it is made from.
+        term: the function, and what it declares.
+        options: values of its options.
+    """
+
+    def __init__(
+        self, context: BlockContext, term: Term, options: dict[str, Any]
+    ) -> None:
+        super().__init__(context)
+        self.needs_object = term.needs_object
+        self._features = term.bind(context, options)
+
+    def features(self, td: TensorDictBase) -> Tensor:
+        """See the function."""
+        return self._features(td)
+
+
+def make_block(
+    term: Term, context: BlockContext, options: dict[str, Any]
+) -> StateTransform:
+    """Build the transform of an observation that a recipe names."""
+    if not isinstance(term.make, type):
+        return FunctionBlock(context, term, options)
+    block = term.make(context, **options)
+    if term.needs_object:
+        block.needs_object = True
+    return block
+
+
+def own_object(td: TensorDictBase, *names: str) -> list[Tensor]:
+    """Fields of each hand's own object: pos, quat, vel, row or present."""
+    return [td[keys.OWN, name] for name in names]
+
+
+def to_wrist(quat: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate world vectors (N, 2, P, 3) into the wrist frames (N, 2, 4)."""
+    return quat_rotate_inverse(quat.unsqueeze(-2), vectors)
+
+
+def positive_quat(quat: Tensor) -> Tensor:
+    """The same rotations with w >= 0, (..., 4)."""
+    return torch.where(quat[..., :1] < 0, -quat, quat)

@@ -1,4 +1,4 @@
-"""Contact wrench of each link, coded in seven bytes.
+"""Observation block: contact wrench of each link, coded in seven bytes.
 
 What physics alone knows has to be stored in replay, next to the state. A link's
 contact with the object of its hand is one net force and one force-weighted point;
@@ -15,7 +15,14 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from flashdex.geometry.rotation import quat_rotate_inverse
+from flashdex import keys
+from flashdex.envs.mdp.term import observation
+from flashdex.geometry.rotation import (
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    quat_rotate_inverse,
+)
 
 CODE_WIDTH = 7
 MAX_FORCE = 500.0  # N; larger forces saturate
@@ -69,3 +76,36 @@ def decode_contact(code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     size = direction.norm(dim=-1, keepdim=True)
     direction = direction / size.clamp_min(1e-6)
     return direction, value[..., 3:4] * _LOG_MAX, value[..., 4:] * POINT_RANGE
+
+
+@observation(inputs=lambda td: (td[keys.KIN], td[keys.CONTACT]), needs_object=True)
+def contact(kin: TensorDictBase, code: Tensor) -> Tensor:
+    """Contact wrench and contact point of each link, in the wrist frame.
+
+    (N, 2, 11 L): force and torque about the link origin as
+    (unit vector * log(1 + n), log(1 + n)), then the point relative to the palm; zeros
+    without contact.
+
+    Args:
+        kin: forward kinematics.
+        code: contact codes, (N, 2, L, 7) int8.
+    """
+    direction, log_force, lever = decode_contact(code)
+    quat = kin["wrist_quat"].unsqueeze(-2)
+    in_wrist = quat_mul(quat_conj(quat), kin["link_quat"])
+    force = torch.expm1(log_force)
+    torque = torch.linalg.cross(lever, direction * force, dim=-1)
+    torque_size = torque.norm(dim=-1, keepdim=True)
+    log_torque = torch.log1p(torque_size)
+    unit_torque = torque / torque_size.clamp_min(1e-9)
+    touches = (log_force > 0).to(lever.dtype)
+    origin = quat_rotate_inverse(quat, kin["link_pos"] - kin["wrist_pos"].unsqueeze(-2))
+    point = (origin + quat_rotate(in_wrist, lever)) * touches
+    parts = [
+        quat_rotate(in_wrist, direction) * log_force,
+        log_force,
+        quat_rotate(in_wrist, unit_torque) * log_torque,
+        log_torque,
+        point,
+    ]
+    return torch.cat(parts, -1).flatten(-2)

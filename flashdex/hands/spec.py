@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from types import ModuleType
 
 import mujoco
@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
 from flashdex.keys import FINGERS, SIDES, Side
-
-HANDS = ("xhand",)
 
 # Six joints move the base: three slides, then hinges about z, x and -y. (name, axis)
 WRIST_JOINTS: tuple[tuple[str, tuple[float, float, float]], ...] = (
@@ -106,7 +104,7 @@ class HandSpec:
 
     @property
     def num_joints(self) -> int:
-        """Joints, the six of the wrist included."""
+        """J, the six joints of the wrist included."""
         return len(self.joint_names)
 
     @property
@@ -119,30 +117,14 @@ class HandSpec:
         """Axes of the wrist joints, each in the frame of its own link, (6, 3)."""
         return self.joint_axis[:NUM_WRIST_JOINTS]
 
-    @property
-    def kp(self) -> Floats:
-        """Stiffness of the preset ``paper``, (J,)."""
-        return self.gains["paper"].kp
 
-    @property
-    def kv(self) -> Floats:
-        """Servo damping of the preset ``paper``, (J,)."""
-        return self.gains["paper"].kv
-
-    @property
-    def force_limit(self) -> Floats:
-        """Force bound of the preset ``paper``, N or N m, (J,)."""
-        return self.gains["paper"].force_limit
+def known_hands() -> list[str]:
+    """Names of the built-in hands: the folders beside this file that hold models."""
+    return sorted(f.parent.name for f in Path(__file__).parent.glob("*/left.xml"))
 
 
 def load_hand(name: str) -> dict[Side, HandSpec]:
     """Load both sides of a built-in hand.
-
-    Args:
-        name: ``xhand``.
-
-    Returns:
-        The spec of each side.
 
     Raises:
         UnknownHandError: the name is not built in.
@@ -151,14 +133,14 @@ def load_hand(name: str) -> dict[Side, HandSpec]:
         >>> sorted(load_hand("xhand"))
         ['left', 'right']
     """
-    if name not in HANDS:
-        raise UnknownHandError(name, HANDS)
+    if name not in known_hands():
+        raise UnknownHandError(name, known_hands())
     facts = importlib.import_module(f"flashdex.hands.{name}")
     return {side: _make_spec(name, side, facts) for side in SIDES}
 
 
 def _make_spec(name: str, side: Side, facts: ModuleType) -> HandSpec:
-    file = resources.files(facts) / f"{side}.xml"
+    file = Path(str(facts.__file__)).with_name(f"{side}.xml")
     mjcf = file.read_text()
     model = mujoco.MjSpec.from_string(mjcf).compile()
     _refuse_unsupported(model, where=str(file))

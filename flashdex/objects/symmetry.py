@@ -29,7 +29,7 @@ def revolution_axis(mesh: trimesh.Trimesh) -> np.ndarray | None:
         Unit vector in the mesh's frame, its largest component positive, (3,); the axis
         passes through the centroid of the surface. Any axis of a sphere.
     """
-    centre, moments, axes = _surface_moments(np.asarray(mesh.triangles))
+    centre, moments, axes = _surface_moments(mesh)
     samples, *_ = trimesh.sample.sample_surface(mesh, NUM_SAMPLES, seed=0)
     samples = np.asarray(samples) - centre
     moved = mesh.copy()
@@ -54,18 +54,13 @@ def _turns(axis: np.ndarray) -> list[np.ndarray]:
     return [np.asarray(turn)[:3, :3] for turn in turns]
 
 
-def _surface_moments(
-    triangles: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centroid, and principal moments with their axes (columns), of triangles.
+def _surface_moments(mesh: trimesh.Trimesh) -> tuple[np.ndarray, ...]:
+    """Centroid, and principal moments with their axes (columns), of a surface.
 
     The integral of x x^T over a triangle of area A and corners v_i is
     ``A / 12 (sum_i v_i v_i^T + s s^T)`` with ``s = sum_i v_i``.
     """
-    cross = np.cross(
-        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    )
-    area = np.linalg.norm(cross, axis=1) / 2
+    triangles, area = np.asarray(mesh.triangles), mesh.area_faces
     centre = (area[:, None] * triangles.mean(axis=1)).sum(axis=0) / area.sum()
     corners = triangles - centre
     total = corners.sum(axis=1)

@@ -1,35 +1,24 @@
-"""One recording after another: read, repair, cut, prepare; nothing raises.
+"""One recording after another, each found in the cache or prepared into it.
 
-This is what a worker process does. Whatever is wrong with a recording becomes a
-rejected row of the report, so that one bad file never costs the others.
+This is what a worker process does.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flashdex.datasets.demo import MAX_SECONDS, HumanDemo
 from flashdex.datasets.source import Recording
-from flashdex.errors import DemoError, LibraryError, MeshError
-from flashdex.motions.checks.recording import Finding, concerning
+from flashdex.errors import LibraryError
+from flashdex.motions.findings import of_error, reject
 from flashdex.motions.pipeline.cache import cache_file, read_prepared, write_prepared
 from flashdex.motions.pipeline.motion import (
     MotionSettings,
     Prepared,
-    prepare_motion,
-    reject,
+    prepare_recording,
+    rejected,
 )
-from flashdex.motions.repair.repair import repair
-from flashdex.motions.repair.segment import segment
-
-logger = logging.getLogger(__name__)
-
-WARNINGS = ("W_", "E_")  # a reader that goes on after an error has repaired it
 
 
 @dataclass(frozen=True)
@@ -42,17 +31,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a worker gives back; the motions stay on the disk where that is possible.
+    """What a worker gives back; the motions stay on the disk where that is possible."""
 
-    Attributes:
-        rows: of the report, one a motion.
-        file: that keeps the motions, if they could be kept.
-        prepared: the motions themselves, if not.
-    """
-
-    rows: list[dict[str, Any]]
-    file: Path | None
-    prepared: list[Prepared]
+    rows: list[dict[str, Any]]  # of the report, one a motion
+    file: Path | None  # that keeps the motions, if they could be kept
+    prepared: list[Prepared]  # the motions themselves, if not
 
     def load(self, root: Path) -> list[Prepared]:
         """The motions.
@@ -84,8 +67,8 @@ def run_job(job: Job, *, carry: bool = False) -> Outcome:
     try:
         file = cache_file(job.recording, job.settings)
     except OSError as error:
-        rejected = _reject(job.recording.name, "E_FILE", f"cannot be read: {error}")
-        return Outcome([rejected.row], None, [rejected])
+        item = rejected(job.recording.name, [of_error(error)])
+        return Outcome([item.row], None, [item])
     prepared = read_prepared(file, root)
     is_kept = prepared is not None
     if prepared is None:
@@ -100,92 +83,5 @@ def run_job(job: Job, *, carry: bool = False) -> Outcome:
 def crashed(job: Job) -> Outcome:
     """The outcome of a job whose worker died."""
     text = "the worker process died (out of memory, or a crash in a mesh library)"
-    rejected = _reject(job.recording.name, "E_CRASH", text)
-    return Outcome([rejected.row], None, [rejected])
-
-
-def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
-    """All motions of a recording, rejected ones too.
-
-    Args:
-        recording: listed by a source.
-        settings: how.
-    """
-
-    def read_all() -> list[Prepared]:
-        demos = recording.read()
-        return [item for demo in demos for item in prepare_demo(demo, settings)]
-
-    return _guard(recording.name, read_all)
-
-
-def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
-    """Repair a demonstration, cut it if it is to be cut, prepare every piece.
-
-    Args:
-        demo: as read.
-        settings: how.
-    """
-    return _guard(demo.name, partial(_prepare_pieces, demo, settings))
-
-
-def _prepare_pieces(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
-    demo = _paced(demo, settings.speed)
-    demo.validate(complete=False)
-    is_cut = _is_cut(demo, settings)
-    pieces, findings = repair(demo, keep_gaps=is_cut)
-    findings += _notes(demo)
-    if is_cut and pieces:
-        pieces, remarks = segment(pieces[0])
-        findings += remarks
-    if not pieces:
-        return [reject(demo.name, findings)]
-    return [item for p in pieces for item in _prepare_piece(p, settings, findings)]
-
-
-def _prepare_piece(
-    piece: HumanDemo, settings: MotionSettings, findings: list[Finding]
-) -> list[Prepared]:
-    told = concerning(findings, piece)
-    return _guard(piece.name, lambda: [prepare_motion(piece, settings, told)])
-
-
-def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
-    """What one step makes; what goes wrong in it costs nothing but this step."""
-    try:
-        return make()
-    except (DemoError, MeshError) as error:
-        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        return [_reject(name, code, str(error))]
-    except OSError as error:  # a name too long, a folder that may not be entered
-        return [_reject(name, "E_FILE", f"cannot be read: {error}")]
-    except Exception as error:  # what no check foresaw must not end the others
-        logger.debug("%s", name, exc_info=True)
-        return [_reject(name, "E_READ", f"unforeseen {type(error).__name__}: {error}")]
-
-
-def _notes(demo: HumanDemo) -> list[Finding]:
-    """Remarks of the reader: ``CODE: text``."""
-    found = []
-    for note in demo.provenance.get("notes", []):
-        code, _, text = str(note).partition(": ")
-        found.append(Finding(code, "warn" if code[:2] in WARNINGS else "info", text))
-    return found
-
-
-def _paced(demo: HumanDemo, speed: float) -> HumanDemo:
-    if speed == 1.0:
-        return demo
-    told = demo.provenance | {"speed": speed}
-    return replace(demo, fps=demo.fps * speed, provenance=told)
-
-
-def _is_cut(demo: HumanDemo, settings: MotionSettings) -> bool:
-    if settings.cut == "never":
-        return False
-    long = demo.seconds > MAX_SECONDS
-    return demo.needs_cutting or long or settings.cut == "always"
-
-
-def _reject(name: str, code: str, text: str) -> Prepared:
-    return reject(name, [Finding(code, "reject", text)])
+    item = rejected(job.recording.name, [reject("E_CRASH", text)])
+    return Outcome([item.row], None, [item])

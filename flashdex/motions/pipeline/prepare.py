@@ -11,22 +11,21 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flashdex.datasets import list_recordings
 from flashdex.datasets.source import Recording, SourceOptions
 from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
+from flashdex.motions.findings import reject
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.pipeline.cache import cache_file, content_hash
 from flashdex.motions.pipeline.jobs import Job, Outcome
-from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.motion import MotionSettings, rejected
 from flashdex.motions.pipeline.workers import run_jobs
-from flashdex.motions.retarget.residuals import RetargetWeights
-from flashdex.objects.asset import ObjectSettings
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 _LOG = logging.getLogger(__name__)
@@ -39,99 +38,18 @@ class Order:
     """What is to be prepared, and how.
 
     Args:
-        source: name of a reader.
+        source: name of a reader, see ``flashdex.datasets.SOURCES``.
         options: what it is told.
         settings: of the preparation.
     """
 
     source: str
-    options: SourceOptions
-    settings: MotionSettings
+    options: SourceOptions = field(default_factory=SourceOptions)
+    settings: MotionSettings = field(default_factory=MotionSettings)
 
     def recordings(self) -> list[Recording]:
         """The recordings, listed but not read."""
         return list_recordings(self.source, self.options)
-
-
-def prepare(
-    source: str,
-    input: str | Path | None = None,
-    hand: str = "xhand",
-    out: str | Path = "library",
-    *,
-    control_hz: float = 60.0,
-    workers: int = 1,
-    ray: bool = False,
-    limit: int | None = None,
-    seed: int = 0,
-    mano: Path | None = None,
-    models: Path | None = None,
-    splits: Path | None = None,
-    cut: Literal["auto", "always", "never"] = "auto",
-    speed: float = 1.0,
-    strict: bool = False,
-    objects: ObjectSettings | None = None,
-    weights: RetargetWeights | None = None,
-    cache_dir: Path | None = None,
-    progress: bool | None = None,
-) -> MotionLibrary:
-    """Prepare a collection of recordings as a motion library.
-
-    What was prepared before, with the same content, settings and code, comes from the
-    cache: an interrupted preparation goes on where it was.
-
-    Args:
-        source: name of a reader, see ``flashdex.datasets.SOURCES``.
-        input: what it reads, mostly the dataset's folder.
-        hand: robot hand.
-        out: directory of the library; an older library there is replaced at the end.
-        control_hz: frames a second of the references.
-        workers: processes.
-        ray: use a Ray cluster in place of processes.
-        limit: at most this many recordings.
-        seed: of made-up motions.
-        mano: folder with the MANO models, for sources that need them.
-        models: folder of the object models, where it lies apart from the dataset.
-        splits: file that names each recording's split, where it lies apart.
-        cut: see ``MotionSettings``.
-        speed: of playback; 0.5 makes every motion last twice as long.
-        strict: reject what would be flagged.
-        objects: how meshes become objects.
-        weights: of the retargeting.
-        cache_dir: of prepared objects and motions.
-        progress: show a bar; by default when standard error is a terminal.
-
-    Returns:
-        The library; ``report.csv`` in it has a row for every motion, rejected ones too.
-
-    Raises:
-        FlashdexError: unknown names, unreadable input, nothing kept, disk refused.
-
-    Example:
-        >>> library = prepare("procedural", out="/tmp/quickstart")  # doctest: +SKIP
-        >>> library.num_motions  # doctest: +SKIP
-        4
-    """
-    options = SourceOptions(
-        path=None if input is None else Path(input),
-        mano=mano,
-        models=models,
-        splits=splits,
-        seed=seed,
-        limit=limit,
-    )
-    settings = MotionSettings(
-        hand=hand,
-        control_hz=control_hz,
-        objects=objects or ObjectSettings(),
-        weights=weights or RetargetWeights(),
-        cut=cut,
-        speed=speed,
-        strict=strict,
-        cache_dir=cache_dir,
-    )
-    order = Order(source, options, settings)
-    return run_order(order, out, workers=workers, ray=ray, progress=progress)
 
 
 def run_order(
@@ -142,14 +60,28 @@ def run_order(
     ray: bool = False,
     progress: bool | None = None,
 ) -> MotionLibrary:
-    """Prepare what an order names; see :func:`prepare`.
+    """Prepare a collection of recordings as a motion library.
+
+    What was prepared before, with the same content, settings and code, comes from the
+    cache: an interrupted preparation goes on where it was.
 
     Args:
         order: recordings and settings.
-        out: directory of the library.
+        out: directory of the library; an older library there is replaced at the end.
         workers: processes.
         ray: use a Ray cluster in place of processes.
-        progress: show a bar.
+        progress: show a bar; by default when standard error is a terminal.
+
+    Returns:
+        The library; ``report.csv`` in it has a row for every motion, rejected ones too.
+
+    Raises:
+        FlashdexError: unknown names, unreadable input, nothing kept, disk refused.
+
+    Example:
+        >>> library = run_order(Order("procedural"), "/tmp/made")  # doctest: +SKIP
+        >>> library.num_motions  # doctest: +SKIP
+        4
     """
     settings = order.settings
     load_hand(settings.hand)  # refuses an unknown name before anything is read
@@ -159,9 +91,12 @@ def run_order(
     _tell_start(jobs, workers)
     outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.rows] + doubles
-    manifest = _facts(order, listed, rows)
-    hand, fps = settings.hand, settings.control_hz
-    writer = LibraryWriter(out, hand=hand, fps=fps, manifest=manifest)
+    writer = LibraryWriter(
+        out,
+        hand=settings.hand,
+        fps=settings.control_hz,
+        manifest=_facts(order, listed, rows),
+    )
     for record in _records(outcomes, settings.cache_root):
         writer.add(record)
     _refuse_empty(rows, out)
@@ -183,11 +118,7 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
 
 
 def hash_inputs(order: Order) -> str:
-    """SHA-256 of the recordings' content and the settings, not of the code.
-
-    Args:
-        order: recordings and settings.
-    """
+    """SHA-256 of the recordings' content and the settings, not of the code."""
     return _hash_inputs(order.recordings(), order.settings)
 
 
@@ -214,10 +145,8 @@ def _without_doubles(
             key = recording.name  # its worker says what cannot be read
         first = kept.setdefault(key, recording)
         if first is not recording:
-            text = f"I_DUP: the same content as '{first.name}'"
-            rows.append(
-                {"motion": recording.name, "status": "rejected", "reason": text}
-            )
+            double = reject("I_DUP", f"the same content as '{first.name}'")
+            rows.append(rejected(recording.name, [double]).row)
     return list(kept.values()), rows
 
 
@@ -259,14 +188,9 @@ def _refuse_empty(rows: list[dict[str, Any]], out: str | Path) -> None:
 
 
 def make_report(rows: list[dict[str, Any]]) -> str:
-    """CSV with a row a motion; the columns are motion, status, reason, figures.
-
-    Args:
-        rows: of all motions, kept or not.
-    """
-    figures = dict.fromkeys(key for row in rows for key in row)
-    columns = ["motion", "status", "reason"]
-    columns += [key for key in figures if key not in columns]
+    """CSV with a row a motion, kept or not: motion, status, reason, then figures."""
+    first = ("motion", "status", "reason")
+    columns = dict.fromkeys([*first, *(key for row in rows for key in row)])
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()

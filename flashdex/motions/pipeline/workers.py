@@ -11,16 +11,17 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
 from flashdex.errors import MissingExtraError
 from flashdex.motions.pipeline.jobs import Job, Outcome, crashed, run_job
+from flashdex.objects.meshes import MESH_SUFFIXES
 
 _LOG = logging.getLogger(__name__)
 
-MESHES = (".obj", ".stl", ".ply", ".glb", ".off")
 LINE_SECONDS = 15.0  # between progress lines where there is no terminal
 # One worker is one core: threads of torch and CoACD would fight over the others.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -44,9 +45,7 @@ def run_jobs(
     order = _new_meshes_first(jobs)
     queue = [jobs[i] for i in order]
     if ray:
-        pass
-
-        stream = run_on_ray(queue)
+        stream = _run_on_ray(queue)
     elif workers > 1:
         stream = _run_in_processes(queue, workers)
     else:
@@ -63,11 +62,11 @@ def run_jobs(
 
 
 def _new_meshes_first(jobs: list[Job]) -> list[int]:
-    seen: set[str] = set()
+    seen: set[Path] = set()
     first, later = [], []
     for i, job in enumerate(jobs):
         files = job.recording.files
-        meshes = {str(f) for f in files if f.suffix.lower() in MESHES}
+        meshes = {f for f in files if f.suffix.lower() in MESH_SUFFIXES}
         (first if meshes - seen else later).append(i)
         seen |= meshes
     return first + later
@@ -90,12 +89,9 @@ def _run_in_processes(jobs: list[Job], workers: int) -> Iterator[tuple[int, Outc
 def _run_pool(
     jobs: dict[int, Job], workers: int, suspects: list[int]
 ) -> Iterator[tuple[int, Outcome]]:
-    """Run jobs until they are done or the pool breaks.
+    """Run jobs, by place, until they are done or the pool breaks.
 
-    Args:
-        jobs: by place.
-        workers: processes.
-        suspects: filled with the places that were under way when the pool broke.
+    Then ``suspects`` is filled with the places that were under way.
     """
     waiting = list(jobs.items())[::-1]
     running: dict[Future[Outcome], int] = {}
@@ -143,26 +139,17 @@ def _show(
             told = ", ".join(f"{n} {status}" for status, n in sorted(counts.items()))
             bar.set_postfix_str(told, refresh=False)
             bar.update()
-            if bar.disable and progress is None and _is_due(last):
+            due = time.monotonic() - last > LINE_SECONDS
+            if bar.disable and progress is None and due:
                 last = time.monotonic()
                 _LOG.info("prepared %d of %d recordings: %s", done, total, told)
             yield item
 
 
-def _is_due(last: float) -> bool:
-    return time.monotonic() - last > LINE_SECONDS
-
-
-def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
+def _run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
     """Outcomes as they come, with the places of their jobs.
 
     Joins the cluster that ``RAY_ADDRESS`` names, else starts one on this machine.
-
-    Args:
-        jobs: one a recording.
-
-    Raises:
-        MissingExtraError: Ray is not installed.
     """
     try:
         import ray  # pyright: ignore[reportMissingImports]

@@ -17,19 +17,12 @@ from flashdex.keys import Side, sides_of
 
 @dataclass
 class HandSpheres:
-    """Spheres that fill the collision geoms of both hands; [left, right].
+    """Spheres that fill the collision geoms of both hands; [left, right]."""
 
-    Args:
-        link: link of each sphere, (S,).
-        pos: centres in the link's frame, m, (2, S, 3).
-        radius: m, (S,).
-        distal: finger (0 to 4) of spheres on a distal link, else -1, (S,).
-    """
-
-    link: Tensor
-    pos: Tensor
-    radius: Tensor
-    distal: Tensor
+    link: Tensor  # of each sphere, (S,)
+    pos: Tensor  # centres in the link's frame, m, (2, S, 3)
+    radius: Tensor  # m, (S,)
+    distal: Tensor  # finger (0 to 4) of spheres on a distal link, else -1, (S,)
 
 
 def make_spheres(specs: Mapping[Side, HandSpec]) -> HandSpheres:

@@ -40,23 +40,14 @@ ARM_HINGE = Servo(kp=60.0, kv=4.0, force_limit=30.0, armature=0.02, damping=0.1)
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of all joints of a hand, wrist first; each field is (J,), float64.
+    """Gains of all joints of a hand, wrist first; each field is (J,), float64."""
 
-    Args:
-        kp: stiffness, N/m (slides) or N m/rad (hinges).
-        kv: servo damping, N s/m or N m s/rad.
-        force_limit: symmetric bound of the servo force, N or N m.
-        armature: rotor inertia seen at the joint, kg or kg m2.
-        damping: passive damping, N s/m or N m s/rad.
-        frictionloss: dry friction, N or N m.
-    """
-
-    kp: NDArray[np.float64]
-    kv: NDArray[np.float64]
-    force_limit: NDArray[np.float64]
-    armature: NDArray[np.float64]
-    damping: NDArray[np.float64]
-    frictionloss: NDArray[np.float64]
+    kp: NDArray[np.float64]  # stiffness, N/m (slides) or N m/rad (hinges)
+    kv: NDArray[np.float64]  # servo damping, N s/m or N m s/rad
+    force_limit: NDArray[np.float64]  # symmetric bound of the servo force, N or N m
+    armature: NDArray[np.float64]  # rotor inertia seen at the joint, kg or kg m2
+    damping: NDArray[np.float64]  # passive, N s/m or N m s/rad
+    frictionloss: NDArray[np.float64]  # dry friction, N or N m
 
 
 def make_gains(

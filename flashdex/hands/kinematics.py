@@ -208,23 +208,14 @@ def _refuse_different_trees(left: HandSpec, right: HandSpec) -> None:
 
 @dataclass(frozen=True)
 class JointFrames:
-    """World axes of all joints in every frame, and what they do to points.
+    """World axes of all joints in every frame, and what they do to points."""
 
-    Args:
-        axis: unit, world, (T, 2, J, 3).
-        turn: the axis a of a hinge, zero for a slide, (T, 2, 3, J).
-        shift: a x c with a point c on the axis; minus the axis of a slide, likewise.
-        link_pos: link origins, m, world, (T, 2, L, 3).
-        link_quat: link orientations, (T, 2, L, 4).
-        moves: which joint moves which link, (L, J).
-    """
-
-    axis: Tensor
-    turn: Tensor
-    shift: Tensor
-    link_pos: Tensor
-    link_quat: Tensor
-    moves: Tensor
+    axis: Tensor  # unit, (T, 2, J, 3)
+    turn: Tensor  # axis a of a hinge, zero for a slide, (T, 2, 3, J)
+    shift: Tensor  # a x c, c on the axis; minus the axis of a slide, (T, 2, 3, J)
+    link_pos: Tensor  # m, (T, 2, L, 3)
+    link_quat: Tensor  # (T, 2, L, 4)
+    moves: Tensor  # which joint moves which link, (L, J)
 
     def points(self, link: Tensor, local: Tensor) -> Tensor:
         """World positions of points on links, m, (T, 2, P, 3).

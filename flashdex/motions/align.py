@@ -24,35 +24,20 @@ from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 @dataclass
 class AlignedDemo:
-    """Tracks of one motion at the control rate, [left, right]; absent hands are zero.
-
-    Args:
-        name: of the motion.
-        fps: control rate.
-        up: what the recording says is up; only to name axes in its own world.
-        keypoints: m, (T, 2, 21, 3).
-        palm: (T, 2, 7).
-        present: hands that were recorded, (2,).
-        told: object that the recording says each hand uses, -1 for none, (2,).
-        poses: per object (T, 7).
-        meshes: per object, cleaned.
-        object_names: per object.
-        support_z: height of the table in the recording, m.
-        support_found: whether it comes from rest or the reader, not from a guess.
-    """
+    """Tracks of one motion at the control rate; absent hands are zero."""
 
     name: str
     fps: float
-    up: Literal["z", "y", "-y"]
-    keypoints: np.ndarray
-    palm: np.ndarray
-    present: np.ndarray
-    told: np.ndarray
-    poses: list[np.ndarray]
-    meshes: list[trimesh.Trimesh]
+    up: Literal["z", "y", "-y"]  # of the recording; only to name axes in its own world
+    keypoints: np.ndarray  # [left, right], m, (T, 2, 21, 3)
+    palm: np.ndarray  # (T, 2, 7)
+    present: np.ndarray  # hands that were recorded, (2,)
+    told: np.ndarray  # object that the recording says each hand uses, -1 for none, (2,)
+    poses: list[np.ndarray]  # per object (T, 7)
+    meshes: list[trimesh.Trimesh]  # per object, cleaned
     object_names: list[str]
-    support_z: float
-    support_found: bool
+    support_z: float  # height of the table in the recording, m
+    support_found: bool  # whether it comes from rest or the reader, not from a guess
 
     @property
     def num_frames(self) -> int:
@@ -61,12 +46,7 @@ class AlignedDemo:
 
 
 def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
-    """Turn up, shift the table to z = 0, and resample.
-
-    Args:
-        demo: validated.
-        control_hz: frames a second of the result.
-    """
+    """Turn a validated demonstration up, shift the table to z = 0, and resample."""
     meshes = [clean_mesh(body.load_mesh(), name=body.name) for body in demo.objects]
     turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
     poses = [transform_pose(b.pose, turn) for b in demo.objects]

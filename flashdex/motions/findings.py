@@ -20,19 +20,12 @@ FLAGGING = ("W_", "E_")
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark about a motion.
+    """One remark about a motion."""
 
-    Args:
-        code: one of the codes of the documentation.
-        level: whether it costs the motion anything.
-        text: what was measured, and what to do.
-        frames: it concerns, in the recording's numbers; none if it concerns all.
-    """
-
-    code: str
-    level: Level
-    text: str
-    frames: tuple[int, ...] = ()
+    code: str  # one of the codes of the documentation
+    level: Level  # whether it costs the motion anything
+    text: str  # what was measured, and what to do
+    frames: tuple[int, ...] = ()  # in the recording's numbers; none: it concerns all
 
 
 def info(code: str, text: str, frames: tuple[int, ...] = ()) -> Finding:
@@ -54,7 +47,8 @@ def of_error(error: Exception) -> Finding:
     """The rejection that an error about a recording comes to."""
     if isinstance(error, DemoError | MeshError):
         usual = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        return reject(getattr(error, "code", None) or usual, str(error))
+        code, text = getattr(error, "code", None), getattr(error, "text", str(error))
+        return reject(code or usual, text)
     if isinstance(error, OSError):  # a name too long, a folder that may not be entered
         return reject("E_FILE", f"cannot be read: {error}")
     return reject("E_READ", f"unforeseen {type(error).__name__}: {error}")

@@ -20,7 +20,11 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
 from flashdex.keys import FINGERS, SIDES
-from flashdex.motions.library import FRAME_KEYS, QUALITY_KEYS, SCHEMA
+from flashdex.motions.library import (
+    FRAME_KEYS,
+    QUALITY_KEYS,
+    SCHEMA,
+)
 from flashdex.objects.asset import ObjectAsset
 
 # what is no part of the name of a folder, and how long one may be
@@ -56,13 +60,8 @@ class LibraryWriter:
     """Collects motions and writes them as one library directory.
 
     Everything is written to a temporary folder beside the target and renamed at the
-    end, so that a killed run leaves no library and an old one stays as it was.
-
-    Args:
-        path: directory of the library.
-        hand: robot hand of the joint references.
-        fps: control rate of all motions.
-        manifest: more entries of the manifest (settings, versions, source).
+    end, so that a killed run leaves no library and an old one stays as it was. The
+    manifest may be given more entries (settings, versions, source).
     """
 
     def __init__(
@@ -91,10 +90,7 @@ class LibraryWriter:
         self._records.append(record)
 
     def write(self, *, report: str = "") -> Path:
-        """Write the library, replacing one of the same name.
-
-        Args:
-            report: content of report.csv.
+        """Write the library, with ``report`` as report.csv; replaces one of its name.
 
         Raises:
             LibraryError: when there is nothing to write or the disk refuses; nothing
@@ -102,21 +98,19 @@ class LibraryWriter:
         """
         if not self._records:
             raise LibraryError(f"{self.path}: no motion was kept; nothing to write.")
-        work = None
+        name, folder = self.path.name, self.path.parent
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            prefix = f".{self.path.name}-"
-            work = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
-            self._fill(work, report)
-            _swap(work, self.path)
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(
+                prefix=f".{name}-", dir=folder, ignore_cleanup_errors=True
+            ) as work:
+                self._fill(Path(work), report)
+                _swap(Path(work), self.path)
         except (OSError, RuntimeError) as error:
             raise LibraryError(
                 f"{self.path}: could not write the library ({error}). Check free "
-                f"space and permissions of {self.path.parent}."
+                f"space and permissions of {folder}."
             ) from error
-        finally:
-            if work is not None:
-                shutil.rmtree(work, ignore_errors=True)
         return self.path
 
     def _fill(self, work: Path, report: str) -> None:

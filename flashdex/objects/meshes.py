@@ -43,10 +43,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
-        raise MeshError(
-            f"{path}: not readable as a mesh ({error}). "
-            f"Allowed: {', '.join(MESH_SUFFIXES)}."
-        ) from error
+        text = f"{path}: not readable as a mesh ({error}). Allowed: "
+        raise MeshError(f"{text}{', '.join(MESH_SUFFIXES)}.") from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -62,14 +60,11 @@ def _refuse_large(scene: trimesh.Scene) -> None:
 
 
 def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
-    """Check a mesh and repair what can be repaired without changing its shape.
+    """A mesh (m) with what can be repaired without changing its shape; a new one.
 
     Merges vertices, drops faces without area and loose components below 1 % of the
-    area, makes the winding consistent and outward, closes small holes.
-
-    Args:
-        mesh: as loaded, m; not changed. The result may still have holes.
-        name: file or object, for messages.
+    area, makes the winding consistent and outward, closes small holes; others stay.
+    The name, of a file or object, is for messages.
 
     Raises:
         MeshError: nothing to simulate: empty, too few vertices, not finite, flat, or

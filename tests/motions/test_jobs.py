@@ -15,10 +15,9 @@ from flashdex.errors import DemoError
 from flashdex.motions.align import align
 from flashdex.motions.checks.aligned import check_left_out
 from flashdex.motions.contact.roles import find_roles
-from flashdex.motions.pipeline.jobs import Job, run_job
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
-from flashdex.motions.pipeline.workers import run_jobs
+from flashdex.motions.pipeline.workers import Job, run_job, run_jobs
 from flashdex.motions.repair.repair import repair
 from flashdex.objects.asset import ObjectSettings
 

@@ -39,10 +39,7 @@ def check_aligned(
 ) -> tuple[list[Finding], dict[str, float]]:
     """Objects, activity, contact, support and penetration of the human motion.
 
-    Args:
-        motion: with its roles.
-        assets: its objects, by slot.
-        sdf: distances of their meshes, by slot.
+    Assets and the distances of their meshes are by slot.
 
     Returns:
         Findings, and figures for the report.
@@ -166,12 +163,7 @@ WRIST_ACCELERATION = 60.0  # m/s^2
 def check_reference(
     motion: Interaction, attempt: Attempt, joint_range: np.ndarray
 ) -> tuple[list[Finding], dict[str, float]]:
-    """Tip error, joint limits and penetration of the robot's reference.
-
-    Args:
-        motion: with its roles.
-        attempt: the reference.
-        joint_range: lower and upper limits, m and rad, (2, J, 2).
+    """Tip error, joint limits (2, J, 2) and penetration of the robot's reference.
 
     Returns:
         Findings, and figures for the report.
@@ -182,17 +174,18 @@ def check_reference(
     edge = 0.005 * (ranges[..., 1] - ranges[..., 0])
     at_limit = (fingers < ranges[..., 0] + edge) | (fingers > ranges[..., 1] - edge)
     saturated = float(at_limit[:, motion.active].mean())
-    figures = {
-        "tip_error_median_mm": round(1e3 * float(np.median(tip_error)), 2),
-        "tip_error_p95_mm": round(1e3 * p95, 2),
-        "penetration_median_mm": round(1e3 * float(np.median(depth.objects)), 2),
-        "penetration_p95_mm": round(1e3 * float(np.quantile(depth.objects, 0.95)), 2),
-        "penetration_max_mm": round(1e3 * float(depth.objects.max()), 2),
-        "table_max_mm": round(1e3 * float(depth.table.max()), 2),
-        "self_p95_mm": round(1e3 * float(np.quantile(depth.own, 0.95)), 2),
-        "hands_max_mm": round(1e3 * float(depth.hands.max()), 2),
-        "at_limit_share": round(saturated, 3),
+    lengths = {
+        "tip_error_median_mm": np.median(tip_error),
+        "tip_error_p95_mm": p95,
+        "penetration_median_mm": np.median(depth.objects),
+        "penetration_p95_mm": np.quantile(depth.objects, 0.95),
+        "penetration_max_mm": depth.objects.max(),
+        "table_max_mm": depth.table.max(),
+        "self_p95_mm": np.quantile(depth.own, 0.95),
+        "hands_max_mm": depth.hands.max(),
     }
+    figures = {name: round(1e3 * float(value), 2) for name, value in lengths.items()}
+    figures["at_limit_share"] = round(saturated, 3)
     found = []
     if mean > IK_MEAN or p95 > IK_P95:
         text = f"robot tips {1e3 * mean:.0f} mm (p95 {1e3 * p95:.0f} mm) off human tips"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import torch
 import trimesh
@@ -72,26 +74,17 @@ def _shape_of(asset: ObjectAsset) -> tuple[float, np.ndarray | None]:
 def check_overlap(
     assets: list[ObjectAsset], poses: list[np.ndarray], sdf: SdfGrid
 ) -> list[Finding]:
-    """Objects that are inside of each other in the first frame.
-
-    Args:
-        assets: by slot.
-        poses: by slot, (T, 7).
-        sdf: distances of the meshes, by slot.
-    """
+    """Objects that are inside of each other in the first frame; all by slot."""
     depth, pair = 0.0, (0, 0)
-    for a, first in enumerate(assets):
-        turn, shift = rotation(poses[a][0, 3:]), poses[a][0, :3]
+    turns = [rotation(pose[0, 3:]) for pose in poses]
+    for a, b in permutations(range(len(assets)), 2):
+        first = assets[a]
         points = np.concatenate([first.points, first.visual_vertices]).astype(float)
-        world = turn.apply(points) + shift
-        for b in range(len(assets)):
-            if b == a:
-                continue
-            local = rotation(poses[b][0, 3:]).inv().apply(world - poses[b][0, :3])
-            distance, _ = sdf.query(torch.tensor(local), torch.tensor(b))
-            deepest = -float(distance.min())
-            if deepest > depth:
-                depth, pair = deepest, (a, b)
+        world = turns[a].apply(points) + poses[a][0, :3]
+        local = turns[b].inv().apply(world - poses[b][0, :3])
+        distance, _ = sdf.query(torch.tensor(local), torch.tensor(b))
+        if -float(distance.min()) > depth:
+            depth, pair = -float(distance.min()), (a, b)
     if depth <= OVERLAP:
         return []
     names = [assets[i].name for i in pair]

@@ -44,12 +44,7 @@ class Activity:
 
 
 def find_activity(demo: HumanDemo, meshes: list[trimesh.Trimesh]) -> Activity:
-    """Contact and motion of a session; nothing is touched where a track is missing.
-
-    Args:
-        demo: with NaN where a hand or an object was not tracked.
-        meshes: of its objects, m.
-    """
+    """Contact and motion of a session; nothing is touched where a track is NaN."""
     sides: list[Side] = [s for s in SIDES if s in demo.keypoints]
     points = [demo.keypoints[s] for s in sides]
     poses = [body.pose for body in demo.objects]

@@ -36,20 +36,14 @@ STEP_SECONDS = 0.1
 class Interaction(AlignedDemo):
     """An aligned motion of which it is known who uses what; its objects have slots.
 
-    Args:
-        active: hands that touch an object, (2,).
-        hand_object: slot of each hand's object, -1 for none, (2,).
-        tip_dist: to the surface of that object, m, (T, 2, 5). An idle hand has the
-            distances to the object nearest to it, but no slot.
-        contact: fingers in contact, (T, 2, 5) bool.
-        left_out: poses (T, 7) of objects that found no slot, by name.
+    An idle hand has the distances to the object nearest to it, but no slot.
     """
 
-    active: np.ndarray
-    hand_object: np.ndarray
-    tip_dist: np.ndarray
-    contact: np.ndarray
-    left_out: dict[str, np.ndarray]
+    active: np.ndarray  # hands that touch an object, (2,)
+    hand_object: np.ndarray  # slot of each hand's object, -1 for none, (2,)
+    tip_dist: np.ndarray  # to the surface of that object, m, (T, 2, 5)
+    contact: np.ndarray  # fingers in contact, (T, 2, 5) bool
+    left_out: dict[str, np.ndarray]  # poses (T, 7) of objects without a slot, by name
 
 
 def find_roles(aligned: AlignedDemo) -> Interaction:
@@ -89,11 +83,7 @@ def find_roles(aligned: AlignedDemo) -> Interaction:
 
 
 def choose_object(distances: list[np.ndarray]) -> int:
-    """Which object a hand touches longest; the nearest one breaks ties.
-
-    Args:
-        distances: per object (T, 5), m.
-    """
+    """The object, given distances (T, 5), touched longest; the nearest breaks ties."""
     nearest = [d.min(axis=1) for d in distances]
     scores = [(int((n < CONTACT_DISTANCE).sum()), -float(n.min())) for n in nearest]
     return max(range(len(scores)), key=scores.__getitem__)
@@ -103,15 +93,12 @@ def choose_object(distances: list[np.ndarray]) -> int:
 class Use:
     """Who takes part in a stretch of a session; objects by their place in the session.
 
-    Args:
-        hand_object: object of every hand that acts.
-        objects: those to keep, most touched first.
-        left_out: names of objects that take part but find no slot, or that move
-            although nothing touches them.
+    Left out are objects that take part but find no slot, and those that move although
+    nothing touches them.
     """
 
-    hand_object: dict[Side, int]
-    objects: list[int]
+    hand_object: dict[Side, int]  # of every hand that acts
+    objects: list[int]  # those to keep, most touched first
     left_out: list[str]
 
 

@@ -43,11 +43,7 @@ def content_hash(recording: Recording) -> str:
 
 
 def cache_file(recording: Recording, settings: MotionSettings) -> Path:
-    """Where the result of a recording is kept.
-
-    Args:
-        recording: listed.
-        settings: that it is prepared with; they name the cache too.
+    """Where the result of a recording with these settings is kept.
 
     Raises:
         OSError: a file of the recording cannot be read.
@@ -73,12 +69,7 @@ def _code_hash() -> str:
 
 
 def write_prepared(file: Path, prepared: list[Prepared]) -> None:
-    """Keep the outcome of a recording; a failure is logged and not fatal.
-
-    Args:
-        file: from ``cache_file``.
-        prepared: all motions of the recording, rejected ones too.
-    """
+    """Keep all motions of a recording, rejected ones too; a failure is only logged."""
     arrays: dict[str, np.ndarray] = {}
     entries: list[dict[str, Any]] = []
     for i, item in enumerate(prepared):
@@ -103,9 +94,7 @@ def write_prepared(file: Path, prepared: list[Prepared]) -> None:
 def read_prepared(file: Path, root: Path) -> list[Prepared] | None:
     """What ``write_prepared`` kept; None when it, or an object of it, is not there.
 
-    Args:
-        file: from ``cache_file``.
-        root: of the cache, where the objects are.
+    The objects are in the cache ``root``.
     """
     if not file.is_file():
         return None

@@ -51,28 +51,19 @@ logger = logging.getLogger(__name__)
 class MotionSettings:
     """How motions are prepared.
 
-    Args:
-        hand: robot hand.
-        control_hz: frames a second of the references.
-        objects: how meshes become objects.
-        weights: of the retargeting.
-        attempts: of the inverse kinematics at most; the best one is kept.
-        cut: cut recordings where contact begins and ends: ``auto`` cuts sessions and
-            what lasts too long, ``never`` takes every recording as it is.
-        speed: of playback; 0.5 makes every motion last twice as long.
-        strict: reject what would be flagged.
-        cache_dir: of prepared objects and motions; the user's cache by default.
+    Recordings are cut where contact begins and ends: with ``cut="auto"`` sessions and
+    what lasts too long, with ``"never"`` every recording is taken as it is.
     """
 
-    hand: str = "xhand"
-    control_hz: float = 60.0
+    hand: str = "xhand"  # robot hand
+    control_hz: float = 60.0  # frames a second of the references
     objects: ObjectSettings = field(default_factory=ObjectSettings)
     weights: RetargetWeights = field(default_factory=RetargetWeights)
-    attempts: int = 6
+    attempts: int = 6  # of the inverse kinematics at most; the best one is kept
     cut: Literal["auto", "always", "never"] = "auto"
-    speed: float = 1.0
-    strict: bool = False
-    cache_dir: Path | None = None
+    speed: float = 1.0  # of playback; 0.5 makes every motion last twice as long
+    strict: bool = False  # reject what would be flagged
+    cache_dir: Path | None = None  # of objects and motions; by default the user's
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense."""
@@ -156,10 +147,7 @@ def prepare_motion(
 ) -> Prepared:
     """Prepare one motion; a fault of the recording becomes a rejected row.
 
-    Args:
-        demo: the recording.
-        settings: how.
-        findings: remarks from earlier steps.
+    The findings are remarks from earlier steps.
     """
     row: dict[str, Any] = {"motion": demo.name}
     findings = list(findings or [])

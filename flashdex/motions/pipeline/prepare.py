@@ -23,9 +23,8 @@ from flashdex.motions.findings import reject
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.pipeline.cache import cache_file, content_hash
-from flashdex.motions.pipeline.jobs import Job, Outcome
 from flashdex.motions.pipeline.motion import MotionSettings, rejected
-from flashdex.motions.pipeline.workers import run_jobs
+from flashdex.motions.pipeline.workers import Job, Outcome, run_jobs
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 _LOG = logging.getLogger(__name__)
@@ -35,15 +34,9 @@ PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be prepared, and how.
+    """What is to be prepared, and how."""
 
-    Args:
-        source: name of a reader, see ``flashdex.datasets.SOURCES``.
-        options: what it is told.
-        settings: of the preparation.
-    """
-
-    source: str
+    source: str  # name of a reader, see ``flashdex.datasets.SOURCES``
     options: SourceOptions = field(default_factory=SourceOptions)
     settings: MotionSettings = field(default_factory=MotionSettings)
 
@@ -112,20 +105,16 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
         with suppress(OSError):
             known += cache_file(job.recording, job.settings).is_file()
     left = len(jobs) - known
-    text = f"{known} of {len(jobs)} recordings are in the cache {root}"
     more = f", {left} to do; a new mesh can take a minute" if left else ""
-    _LOG.info("%s%s", text, more)
+    text = "%d of %d recordings are in the cache %s%s"
+    _LOG.info(text, known, len(jobs), root, more)
 
 
-def hash_inputs(order: Order) -> str:
+def hash_inputs(order: Order, listed: list[Recording] | None = None) -> str:
     """SHA-256 of the recordings' content and the settings, not of the code."""
-    return _hash_inputs(order.recordings(), order.settings)
-
-
-def _hash_inputs(recordings: list[Recording], settings: MotionSettings) -> str:
-    text = json.dumps(settings.facts(), sort_keys=True)
+    text = json.dumps(order.settings.facts(), sort_keys=True)
     digest = hashlib.sha256(text.encode())
-    for recording in recordings:
+    for recording in order.recordings() if listed is None else listed:
         digest.update(recording.name.encode())
         with suppress(OSError):  # a file that cannot be read has no content
             digest.update(content_hash(recording).encode())
@@ -151,13 +140,13 @@ def _without_doubles(
 
 
 def _facts(
-    order: Order, recordings: list[Recording], rows: list[dict[str, Any]]
+    order: Order, listed: list[Recording], rows: list[dict[str, Any]]
 ) -> dict[str, Any]:
     return {
         "source": order.source,
         "seed": order.options.seed,
         "settings": order.settings.facts(),
-        "inputs": _hash_inputs(recordings, order.settings),
+        "inputs": hash_inputs(order, listed),
         "versions": {p: importlib.metadata.version(p) for p in PACKAGES},
         "quality": dict(Counter(row["status"] for row in rows)),
     }

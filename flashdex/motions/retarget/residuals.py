@@ -119,11 +119,9 @@ class Residuals:
         ]
 
     def _table(self, frames: JointFrames, world: Tensor) -> Part:
-        spheres = self.hand.spheres
-        depth = spheres.radius + self.weights.table - world[..., 2]
-        hit = (depth > 0).to(depth.dtype) / self.weights.clear
         up = torch.tensor([0.0, 0.0, 1.0], dtype=world.dtype).expand_as(world)
-        return hit * depth, -hit[..., None] * frames.along(world, up, spheres.link)
+        gap = self.hand.spheres.radius + self.weights.table
+        return self._keep_out(frames, world, gap - world[..., 2], up)
 
     def _touch(self, frames: JointFrames) -> list[Part]:
         """Touching fingers: end spheres at the wanted depth, pads on the surface."""
@@ -149,11 +147,16 @@ class Residuals:
         for slot in range(self.targets.object_pos.shape[1]):
             slots = torch.full_like(self.targets.hand_object, slot)
             distance, slope = self._query(world, slots)
-            depth = gap - distance
-            hit = (depth > 0).to(depth.dtype) / weights.clear
-            jac = frames.along(world, slope, spheres.link)
-            parts.append((hit * depth, -hit[..., None] * jac))
+            parts.append(self._keep_out(frames, world, gap - distance, slope))
         return parts
+
+    def _keep_out(
+        self, frames: JointFrames, world: Tensor, depth: Tensor, slope: Tensor
+    ) -> Part:
+        """Spheres that are too deep, pushed along a slope."""
+        hit = (depth > 0).to(depth.dtype) / self.weights.clear
+        jac = frames.along(world, slope, self.hand.spheres.link)
+        return hit * depth, -hit[..., None] * jac
 
     def _query(self, world: Tensor, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (T, 2, P) and world gradient of points to one object a hand."""

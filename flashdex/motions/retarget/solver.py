@@ -81,12 +81,7 @@ class RetargetResult:
 
 
 class Retargeter:
-    """Solves joint references for one embodiment.
-
-    Args:
-        specs: the hands to solve for, as returned by ``load_hand``; one or both, and
-            where shapes say 2, as many.
-        weights: of the residuals.
+    """Solves joint references for one hand or both; where shapes say 2, as many.
 
     Example:
         >>> retargeter = Retargeter(load_hand("xhand"))  # doctest: +SKIP
@@ -107,10 +102,8 @@ class Retargeter:
     ) -> RetargetResult:
         """Joint references of all frames of a motion; both hands at once.
 
-        Args:
-            targets: what the human hands and the objects do.
-            sdf: distance grids of the objects, row = slot, float64.
-            start: where the iterations begin; free of contact by default.
+        The distance grids have a row a slot, float64. By default the iterations begin
+        free of contact.
         """
         start = start or Start()
         residuals = Residuals(self.hand, targets, sdf, self.weights)
@@ -144,9 +137,8 @@ class Retargeter:
             slope += torch.einsum("thr,thrj->thj", residual, jac)
             curvature += jac.transpose(-1, -2) @ jac
         # a joint at its limit that is pushed outwards takes no part in the step
-        out = ((q <= self.hand.low) & (slope > 0)) | (
-            (q >= self.hand.high) & (slope < 0)
-        )
+        out = (q <= self.hand.low) & (slope > 0)
+        out |= (q >= self.hand.high) & (slope < 0)
         slope = torch.where(out, 0.0, slope)
         curvature = torch.where(out[..., None] | out[..., None, :], 0.0, curvature)
         curvature += torch.diag_embed(out.to(q.dtype))

@@ -77,7 +77,7 @@ def retarget(
     weights: RetargetWeights,
     attempts: int,
 ) -> tuple[Choice, Targets]:
-    """Joint reference of a motion: attempts until one is clean, and the best is kept.
+    """Attempts at a joint reference until one is clean; and what both hands aim at.
 
     Args:
         motion: with its roles.
@@ -85,9 +85,6 @@ def retarget(
         specs: left and right hand.
         weights: of the residuals.
         attempts: at most.
-
-    Returns:
-        The choice, and what was aimed at by both hands.
     """
     targets = make_targets(motion, HandModel(specs))
     scene = make_reference_scene(specs, [a.parts for a in assets])

@@ -30,15 +30,9 @@ class Targets:
 
     def of(self, hands: Tensor) -> Targets:
         """The targets of some hands only, given as rows of the hand axis, int64."""
-        return replace(
-            self,
-            tips=self.tips[:, hands],
-            wrist_pos=self.wrist_pos[:, hands],
-            wrist_quat=self.wrist_quat[:, hands],
-            contact=self.contact[:, hands],
-            hand_object=self.hand_object[hands],
-            palm_normal=self.palm_normal[:, hands],
-        )
+        tracks = ("tips", "wrist_pos", "wrist_quat", "contact", "palm_normal")
+        chosen = {name: getattr(self, name)[:, hands] for name in tracks}
+        return replace(self, hand_object=self.hand_object[hands], **chosen)
 
 
 def make_targets(motion: Interaction, hand: HandModel) -> Targets:

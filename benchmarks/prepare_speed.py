@@ -15,7 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.datasets.source import SourceOptions
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.system.machine import describe_commit, describe_hardware
 
 
@@ -23,7 +25,9 @@ def seconds(limit: int, workers: int, folder: Path, cache: Path) -> float:
     """Wall time of one preparation."""
     start = time.perf_counter()
     out = folder / f"library{workers}"
-    prepare("myodm", out=out, workers=workers, limit=limit, cache_dir=cache)
+    settings = MotionSettings(cache_dir=cache)
+    order = Order("myodm", SourceOptions(limit=limit), settings)
+    run_order(order, out, workers=workers)
     return time.perf_counter() - start
 
 

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from benchmarks.common.library import bench_library
 from benchmarks.suite_parts import CURVE_LIBRARY
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.datasets.source import SourceOptions
+from flashdex.motions.pipeline.prepare import Order, run_order
 
 SCENES = ((2, 16), (2, 1), (2, 4), (2, 8), (1, 16), (1, 1))
 CURVE_MOTIONS = 50
@@ -39,7 +40,8 @@ def make_libraries(folder: Path, *, workers: int) -> dict[str, float]:
     curve = folder / CURVE_LIBRARY
     if not (curve / "manifest.json").is_file():
         begin = time.perf_counter()
-        prepare("procedural", "all", out=curve, limit=CURVE_MOTIONS, workers=workers)
+        options = SourceOptions(path=Path("all"), limit=CURVE_MOTIONS)
+        run_order(Order("procedural", options), curve, workers=workers)
         spent[curve.name] = round(time.perf_counter() - begin, 1)
     return spent
 

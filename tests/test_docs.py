@@ -221,11 +221,13 @@ def needs_of(source):
 
 
 def test_data_page_names_exactly_the_columns_of_a_report(tmp_path):
-    from flashdex.motions.pipeline.prepare import prepare
+    from flashdex.datasets.source import SourceOptions
+    from flashdex.motions.pipeline.motion import MotionSettings
+    from flashdex.motions.pipeline.prepare import Order, run_order
 
-    out = tmp_path / "library"
-    made = {"out": out, "cache_dir": tmp_path / "cache", "progress": False}
-    prepare("procedural", "pick_sphere_right", **made)
+    out, options = tmp_path / "library", SourceOptions(path=Path("pick_sphere_right"))
+    settings = MotionSettings(cache_dir=tmp_path / "cache")
+    run_order(Order("procedural", options, settings), out, progress=False)
     with (out / "report.csv").open() as file:
         columns = set(next(csv.reader(file)))
     assert columns == first_cells("data.md", "report.csv")

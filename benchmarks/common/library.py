@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import FlashdexError, LibraryError
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.objects.asset import ObjectAsset, default_cache_dir
 
 Vertices = NDArray[np.float64]
@@ -104,7 +105,8 @@ def bench_library(objects: int, hulls: int, *, folder: Path | None = None) -> Pa
     if not _is_usable(path):
         base = folder / f"xhand-o{objects}-base"
         if not _is_usable(base):
-            prepare("procedural", input=KINDS[objects], out=base)
+            options = SourceOptions(path=Path(KINDS[objects]))
+            run_order(Order("procedural", options), base)
         recut_library(MotionLibrary.load(base), hulls, path)
     return path
 

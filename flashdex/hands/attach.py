@@ -92,26 +92,19 @@ def _attach_base(scene: mujoco.MjSpec, spec: HandSpec) -> mujoco.MjsBody:
         links.append(parent)
     base = mujoco.MjSpec.from_string(spec.mjcf).worldbody.first_body()
     links.append(parent.add_frame().attach_body(base, spec.prefix, ""))
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     for i, link in enumerate(links):
-        _add_wrist_joint(scene, link, spec, i)
+        # the compiler reads hinge ranges in the unit of the scene, degrees unless told
+        degrees = i >= 3 and scene.compiler.degree
+        limits = spec.joint_range[i]
+        link.add_joint(
+            name=spec.joint_names[i],
+            type=hinge if i >= 3 else slide,
+            axis=spec.joint_axis[i],
+            range=np.rad2deg(limits) if degrees else limits,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        )
     return links[0]
-
-
-def _add_wrist_joint(
-    scene: mujoco.MjSpec, body: mujoco.MjsBody, spec: HandSpec, index: int
-) -> None:
-    hinge = index >= 3
-    kind = mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE
-    # the compiler reads hinge ranges in the unit of the scene, degrees unless told
-    degrees = hinge and scene.compiler.degree
-    limits = spec.joint_range[index]
-    body.add_joint(
-        name=spec.joint_names[index],
-        type=kind,
-        axis=spec.joint_axis[index],
-        range=np.rad2deg(limits) if degrees else limits,
-        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-    )
 
 
 def _set_gains(scene: mujoco.MjSpec, spec: HandSpec, gains: Gains) -> None:

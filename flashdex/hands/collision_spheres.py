@@ -17,27 +17,16 @@ from flashdex.keys import Side, sides_of
 
 @dataclass
 class HandSpheres:
-    """Spheres that fill the collision geoms of both hands; [left, right].
+    """Spheres that fill the collision geoms of both hands; [left, right]."""
 
-    Args:
-        link: link of each sphere, (S,).
-        pos: centres in the link's frame, m, (2, S, 3).
-        radius: m, (S,).
-        distal: finger (0 to 4) of spheres on a distal link, else -1, (S,).
-    """
-
-    link: Tensor
-    pos: Tensor
-    radius: Tensor
-    distal: Tensor
+    link: Tensor  # of each sphere, (S,)
+    pos: Tensor  # centres in the link's frame, m, (2, S, 3)
+    radius: Tensor  # m, (S,)
+    distal: Tensor  # finger (0 to 4) of spheres on a distal link, else -1, (S,)
 
 
 def make_spheres(specs: Mapping[Side, HandSpec]) -> HandSpheres:
-    """Spheres of the hands; capsules and boxes are filled, other geoms refused.
-
-    Args:
-        specs: one hand or both, as returned by ``load_hand``.
-    """
+    """Spheres of one hand or both; capsules and boxes are filled, others refused."""
     sides = sides_of(specs)
     models = [mujoco.MjSpec.from_string(specs[s].mjcf).compile() for s in sides]
     # both sides get as many spheres, though their sizes differ by fractions of a mm
@@ -60,21 +49,15 @@ def _spheres_of(
 ) -> tuple[list[int], np.ndarray, list[float]]:
     names = [n.removeprefix(spec.prefix) for n in spec.link_names]
     links, centres, radii = [], [], []
-    for geom in range(model.ngeom):
-        if model.geom_contype[geom] == 0 and model.geom_conaffinity[geom] == 0:
-            continue
-        body = mujoco.mj_id2name(
-            model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])
-        )
-        local, radius = _fill(
-            int(model.geom_type[geom]), model.geom_size[geom], like[geom]
-        )
+    for i in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+        geom = model.geom(i)
+        local, radius = _fill(int(geom.type[0]), geom.size, like[i])
         matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
-        points = local @ matrix.reshape(3, 3).T + model.geom_pos[geom]
-        links += [names.index(body)] * len(points)
-        centres.append(points)
-        radii += [radius] * len(points)
+        mujoco.mju_quat2Mat(matrix, geom.quat)
+        link = names.index(model.body(int(geom.bodyid[0])).name)
+        links += [link] * len(local)
+        centres.append(local @ matrix.reshape(3, 3).T + geom.pos)
+        radii += [radius] * len(local)
     return links, np.concatenate(centres), radii
 
 
@@ -105,10 +88,7 @@ MIDDLE_KNUCKLE = 9
 
 
 class HandModel:
-    """Both hands, [left, right].
-
-    Args:
-        specs: left and right hand, as returned by ``load_hand``.
+    """What the retargeting needs to know of the hands, [left, right]; float64.
 
     Attributes:
         low: lower joint limits, (2, J); ``high`` likewise.
@@ -123,20 +103,18 @@ class HandModel:
 
     def __init__(self, specs: Mapping[Side, HandSpec]) -> None:
         hands = [specs[side] for side in sides_of(specs)]
-        ranges = np.stack([h.joint_range for h in hands])
-        self.low, self.high = torch.tensor(ranges[..., 0]), torch.tensor(ranges[..., 1])
+
+        def stack(field: str) -> Tensor:
+            return torch.tensor(np.stack([getattr(h, field) for h in hands]))
+
+        self.low, self.high = stack("joint_range").unbind(-1)
         self.relaxed = self.low + RELAXED * (self.high - self.low)
         self.tip_link = torch.as_tensor(hands[0].tip_link)
-        self.tip_pos = _stack([h.tip_pos for h in hands])
-        self.tip_center = _stack([h.tip_center for h in hands])
-        self.tip_radius = _stack([h.tip_radius for h in hands])
-        self.wrist_from_palm = _stack([h.wrist_from_palm for h in hands])
-        self.knuckle = _stack([_knuckle(h) for h in hands])
+        self.tip_pos, self.tip_center = stack("tip_pos"), stack("tip_center")
+        self.tip_radius = stack("tip_radius")
+        self.wrist_from_palm = stack("wrist_from_palm")
+        self.knuckle = torch.tensor(np.stack([_knuckle(h) for h in hands]))
         self.spheres = make_spheres(specs)
-
-
-def _stack(rows: list[np.ndarray]) -> Tensor:
-    return torch.tensor(np.stack(rows), dtype=torch.float64)
 
 
 def _knuckle(spec: HandSpec) -> np.ndarray:

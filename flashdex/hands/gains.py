@@ -6,7 +6,7 @@ passive terms act besides: ``armature q'' + damping q' + frictionloss sign(q')``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
@@ -40,68 +40,45 @@ ARM_HINGE = Servo(kp=60.0, kv=4.0, force_limit=30.0, armature=0.02, damping=0.1)
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of all joints of a hand, wrist first; each field is (J,), float64.
+    """Gains of all joints of a hand, wrist first; each field is (J,), float64."""
 
-    Args:
-        kp: stiffness, N/m (slides) or N m/rad (hinges).
-        kv: servo damping, N s/m or N m s/rad.
-        force_limit: symmetric bound of the servo force, N or N m.
-        armature: rotor inertia seen at the joint, kg or kg m2.
-        damping: passive damping, N s/m or N m s/rad.
-        frictionloss: dry friction, N or N m.
-    """
-
-    kp: NDArray[np.float64]
-    kv: NDArray[np.float64]
-    force_limit: NDArray[np.float64]
-    armature: NDArray[np.float64]
-    damping: NDArray[np.float64]
-    frictionloss: NDArray[np.float64]
+    kp: NDArray[np.float64]  # stiffness, N/m (slides) or N m/rad (hinges)
+    kv: NDArray[np.float64]  # servo damping, N s/m or N m s/rad
+    force_limit: NDArray[np.float64]  # symmetric bound of the servo force, N or N m
+    armature: NDArray[np.float64]  # rotor inertia seen at the joint, kg or kg m2
+    damping: NDArray[np.float64]  # passive, N s/m or N m s/rad
+    frictionloss: NDArray[np.float64]  # dry friction, N or N m
 
 
 def make_gains(
     fingers: list[Servo], *, slide: Servo = WRIST_SLIDE, hinge: Servo = WRIST_HINGE
 ) -> Gains:
-    """Put the wrist servos before those of the fingers.
+    """Gains over all joints: three wrist slides, three wrist hinges, then the fingers.
 
     Args:
         fingers: one servo a finger joint, in the order of the hand's joints.
-        slide: servo of the three wrist slides.
-        hinge: servo of the three wrist hinges.
-
-    Returns:
-        Arrays over all joints, (6 + len(fingers),).
+        slide: servo of each wrist slide.
+        hinge: servo of each wrist hinge.
     """
     servos = [slide] * 3 + [hinge] * 3 + fingers
-    columns = {
-        f.name: np.array([getattr(s, f.name) for s in servos], dtype=np.float64)
-        for f in fields(Gains)
-    }
-    return Gains(**columns)
+    # Servo and Gains have the same fields in the same order
+    rows = np.array([astuple(servo) for servo in servos], dtype=np.float64)
+    return Gains(*np.ascontiguousarray(rows.T))
 
 
 def critical_kv(kp: float, inertia: float) -> float:
-    """Servo damping of ratio one: ``kv = 2 sqrt(kp inertia)``.
+    """Servo damping of ratio one, ``kv = 2 sqrt(kp inertia)``, N m s/rad.
 
     Args:
         kp: stiffness, N m/rad.
         inertia: armature plus link inertia about the joint, kg m2.
-
-    Returns:
-        Damping, N m s/rad.
     """
     return 2.0 * float(np.sqrt(kp * inertia))
 
 
 def servo_lag(gains: Gains) -> NDArray[np.float64]:
-    """Time by which each servo trails a target that moves steadily.
+    """Time by which each servo trails a target that moves steadily, s, (J,).
 
     ``kp (target - q) = (kv + damping) q'`` gives ``lag = (kv + damping) / kp``.
-
-    Args:
-        gains: servos of a hand.
-
-    Returns:
-        s, (J,).
     """
     return (gains.kv + gains.damping) / gains.kp

@@ -1,8 +1,12 @@
-"""Forward kinematics of both hands in torch, batched over worlds, hands and fingers."""
+"""Kinematics of both hands in torch, batched over worlds, hands and fingers.
+
+Forward kinematics (poses and velocities), and the Jacobians of points on the links.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +20,7 @@ from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandError, HandSpec
 from flashdex.keys import Side, sides_of
 
+NUM_SLIDES = 3  # of the wrist; its other joints, and all of the fingers, are hinges
 Pose = tuple[Tensor, Tensor]
 Twist = tuple[Tensor, Tensor]
 
@@ -59,7 +64,7 @@ class HandKinematics(nn.Module):
         super().__init__()
         hands = [specs[side] for side in sides_of(specs)]
         _refuse_different_trees(hands[0], hands[-1])
-        depth = compute_depth(hands[0].link_parent)
+        depth = _lineage(hands[0]).sum(axis=1) - 1
         order = np.argsort(depth, kind="stable")
         starts = np.flatnonzero(np.diff(depth[order], prepend=-1))
         self._levels = [slice(a, b) for a, b in pairwise([*starts, len(order)])]
@@ -171,19 +176,13 @@ class HandKinematics(nn.Module):
         return torch.cat(levels, dim=-2)[..., self.link_order, :]
 
 
-def compute_depth(link_parent: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Depth of each link in the tree; the base has depth 0.
-
-    Args:
-        link_parent: index of the parent, -1 for the base, parents first, (L,).
-
-    Returns:
-        Depth, (L,).
-    """
-    depth = np.zeros(len(link_parent), dtype=np.int64)
-    for link, parent in enumerate(link_parent):
-        depth[link] = depth[parent] + 1 if parent >= 0 else 0
-    return depth
+def _lineage(hand: HandSpec) -> NDArray[np.bool_]:
+    """Which link hangs on which, itself included, (L, L)."""
+    lineage = np.eye(hand.num_links, dtype=bool)
+    for link, parent in enumerate(hand.link_parent):  # parents come first
+        if parent >= 0:
+            lineage[link] |= lineage[parent]
+    return lineage
 
 
 def _link_tables(
@@ -205,3 +204,79 @@ def _refuse_different_trees(left: HandSpec, right: HandSpec) -> None:
                 f"{left.name}, {right.name}: {field} differs between left and right. "
                 "Both sides must have the same links and joints in the same order."
             )
+
+
+@dataclass(frozen=True)
+class JointFrames:
+    """World axes of all joints in every frame, and what they do to points."""
+
+    axis: Tensor  # unit, (T, 2, J, 3)
+    turn: Tensor  # axis a of a hinge, zero for a slide, (T, 2, 3, J)
+    shift: Tensor  # a x c, c on the axis; minus the axis of a slide, (T, 2, 3, J)
+    link_pos: Tensor  # m, (T, 2, L, 3)
+    link_quat: Tensor  # (T, 2, L, 4)
+    moves: Tensor  # which joint moves which link, (L, J)
+
+    def points(self, link: Tensor, local: Tensor) -> Tensor:
+        """World positions of points on links, m, (T, 2, P, 3).
+
+        Args:
+            link: of each point, (P,).
+            local: in the link's frame, m, (2, P, 3).
+        """
+        arm = quat_rotate(self.link_quat[..., link, :], local)
+        return self.link_pos[..., link, :] + arm
+
+    def along(self, world: Tensor, direction: Tensor, link: Tensor) -> Tensor:
+        """How fast points move along given directions, per joint, (T, 2, P, J).
+
+        A slide moves a point by its axis, a hinge by a x (p - c); the latter along n is
+        a . (p x n) - (a x c) . n, two matrix products for all points and joints.
+
+        Args:
+            world: points p, m, (T, 2, P, 3).
+            direction: n, world, (T, 2, P, 3).
+            link: of each point, (P,).
+        """
+        moment = torch.linalg.cross(world, direction)
+        return (moment @ self.turn - direction @ self.shift) * self.moves[link]
+
+    def full(self, world: Tensor, link: Tensor) -> Tensor:
+        """Jacobian of points, rows x, y, z, (T, 2, P, 3, J)."""
+        axes = torch.eye(3, dtype=world.dtype)
+        rows = [self.along(world, axis.expand_as(world), link) for axis in axes]
+        return torch.stack(rows, dim=-2)
+
+
+class HandJacobian:
+    """Joint axes of one hand or both from their link poses."""
+
+    def __init__(self, specs: Mapping[Side, HandSpec]) -> None:
+        hands = [specs[side] for side in sides_of(specs)]
+        self._axes = torch.tensor(np.stack([h.joint_axis for h in hands]))
+        self._link = torch.tensor(np.maximum(hands[0].joint_link, 0))
+        moves = np.ones((hands[0].num_links, hands[0].num_joints))
+        fingers = hands[0].joint_link[NUM_WRIST_JOINTS:]
+        moves[:, NUM_WRIST_JOINTS:] = _lineage(hands[0])[:, fingers]
+        self._moves = torch.tensor(moves)
+
+    def frames(self, q: Tensor, link_pos: Tensor, link_quat: Tensor) -> JointFrames:
+        """World axes and anchors of all joints.
+
+        Args:
+            q: joint positions, (T, 2, J).
+            link_pos: m, world, (T, 2, L, 3).
+            link_quat: wxyz, (T, 2, L, 4).
+        """
+        axes = self._axes.expand(*q.shape[:-1], -1, 3)
+        world = quat_rotate(link_quat[..., self._link, :], axes)
+        first = quat_from_axis_angle(axes[..., 3, :], q[..., 3])
+        world[..., :4, :] = axes[..., :4, :]
+        world[..., 4, :] = quat_rotate(first, axes[..., 4, :])
+        # the last wrist hinge turns about its own axis: the base orientation serves
+        turn = world.clone()
+        turn[..., :NUM_SLIDES, :] = 0.0
+        shift = torch.linalg.cross(turn, link_pos[..., self._link, :])
+        shift[..., :NUM_SLIDES, :] = -world[..., :NUM_SLIDES, :]
+        turn, shift = turn.mT.contiguous(), shift.mT.contiguous()
+        return JointFrames(world, turn, shift, link_pos, link_quat, self._moves)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from types import ModuleType
 
 import mujoco
@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
 from flashdex.keys import FINGERS, SIDES, Side
-
-HANDS = ("xhand",)
 
 # Six joints move the base: three slides, then hinges about z, x and -y. (name, axis)
 WRIST_JOINTS: tuple[tuple[str, tuple[float, float, float]], ...] = (
@@ -45,59 +43,38 @@ class HandSpec:
     Metres, radians, quaternions wxyz. The fixed transform of a link is its pose in its
     parent at joint angle zero; joint axes pass through the link's origin.
 
-    Args:
-        name: embodiment, as in ``load_hand``.
-        side: which hand.
-        mjcf: model of the hand without wrist joints and actuators; names without side.
-        joint_names: six wrist joints, then the fingers' (J).
-        joint_range: lower and upper limit, m or rad, (J, 2).
-        joint_axis: unit axis in the frame of the joint's link, (J, 3).
-        joint_link: link moved by each joint, -1 for wrist joints, (J,).
-        velocity_limit: motor speed, rad/s; infinite for the wrist, (J,).
-        link_names: parents before children (L).
-        link_parent: index of the parent, -1 for the base, (L,).
-        link_pos: origin in the parent's frame, m, (L, 3).
-        link_quat: orientation in the parent's frame, (L, 4).
-        tip_link: distal link of each finger, (5,).
-        tip_pos: tracking point on the pad, in the distal link's frame, m, (5, 3).
-        tip_center: centre of the distal end sphere, m, (5, 3). The distance of a tip to
-            an object is SDF(center) - radius.
-        tip_radius: radius of that sphere, m, (5,).
-        vendor_tip_pos: the vendor's fingertip frame, on the finger's axis, m, (5, 3).
-        keypoint_links: (link, human keypoint 0..20) of every mapped link.
-        level1_links: (link, keypoint) of the proximal links, thumb to pinky.
-        distal_links: (link, keypoint) of the distal links, thumb to pinky.
-        wrist_from_palm: R_palm_base: R_world_base = R_world_palm R_palm_base, (4,).
-        gains: servo presets by name.
-
     Example:
         >>> hand = load_hand("xhand")["left"]
         >>> hand.num_joints, hand.num_links, hand.joint_names[6]
         (18, 13, 'left_hand_thumb_bend_joint')
     """
 
-    name: str
+    name: str  # embodiment, as in ``load_hand``
     side: Side
-    mjcf: str
-    joint_names: tuple[str, ...]
-    joint_range: Floats
-    joint_axis: Floats
-    joint_link: Ints
-    velocity_limit: Floats
-    link_names: tuple[str, ...]
-    link_parent: Ints
-    link_pos: Floats
-    link_quat: Floats
-    tip_link: Ints
-    tip_pos: Floats
+    mjcf: str  # model without wrist joints and actuators; names without side
+    joint_names: tuple[str, ...]  # six wrist joints, then the fingers' (J)
+    joint_range: Floats  # lower and upper limit, m or rad, (J, 2)
+    joint_axis: Floats  # unit axis in the frame of the joint's link, (J, 3)
+    joint_link: Ints  # link moved by each joint, -1 for wrist joints, (J,)
+    velocity_limit: Floats  # motor speed, rad/s; infinite for the wrist, (J,)
+    link_names: tuple[str, ...]  # parents before children (L)
+    link_parent: Ints  # index of the parent, -1 for the base, (L,)
+    link_pos: Floats  # origin in the parent's frame, m, (L, 3)
+    link_quat: Floats  # orientation in the parent's frame, (L, 4)
+    tip_link: Ints  # distal link of each finger, (5,)
+    tip_pos: Floats  # tracking point on the pad, in the distal link's frame, m, (5, 3)
+    # centre and radius of the distal end sphere, m, (5, 3) and (5,): the distance of a
+    # tip to an object is SDF(center) - radius
     tip_center: Floats
     tip_radius: Floats
-    vendor_tip_pos: Floats
+    vendor_tip_pos: Floats  # the vendor's fingertip, on the finger's axis, m, (5, 3)
+    # (link, human keypoint 0..20) of every mapped link; of the proximal and of the
+    # distal ones, thumb to pinky
     keypoint_links: tuple[tuple[int, int], ...]
     level1_links: tuple[tuple[int, int], ...]
     distal_links: tuple[tuple[int, int], ...]
-    wrist_from_palm: Floats
-    gains: Mapping[GainsPreset, Gains]
+    wrist_from_palm: Floats  # R_palm_base of R_world_base = R_world_palm R_palm_base
+    gains: Mapping[GainsPreset, Gains]  # servo presets by name
 
     @property
     def prefix(self) -> str:
@@ -106,7 +83,7 @@ class HandSpec:
 
     @property
     def num_joints(self) -> int:
-        """Joints, the six of the wrist included."""
+        """J, the six joints of the wrist included."""
         return len(self.joint_names)
 
     @property
@@ -119,30 +96,14 @@ class HandSpec:
         """Axes of the wrist joints, each in the frame of its own link, (6, 3)."""
         return self.joint_axis[:NUM_WRIST_JOINTS]
 
-    @property
-    def kp(self) -> Floats:
-        """Stiffness of the preset ``paper``, (J,)."""
-        return self.gains["paper"].kp
 
-    @property
-    def kv(self) -> Floats:
-        """Servo damping of the preset ``paper``, (J,)."""
-        return self.gains["paper"].kv
-
-    @property
-    def force_limit(self) -> Floats:
-        """Force bound of the preset ``paper``, N or N m, (J,)."""
-        return self.gains["paper"].force_limit
+def known_hands() -> list[str]:
+    """Names of the built-in hands: the folders beside this file that hold models."""
+    return sorted(f.parent.name for f in Path(__file__).parent.glob("*/left.xml"))
 
 
 def load_hand(name: str) -> dict[Side, HandSpec]:
     """Load both sides of a built-in hand.
-
-    Args:
-        name: ``xhand``.
-
-    Returns:
-        The spec of each side.
 
     Raises:
         UnknownHandError: the name is not built in.
@@ -151,14 +112,14 @@ def load_hand(name: str) -> dict[Side, HandSpec]:
         >>> sorted(load_hand("xhand"))
         ['left', 'right']
     """
-    if name not in HANDS:
-        raise UnknownHandError(name, HANDS)
+    if name not in known_hands():
+        raise UnknownHandError(name, known_hands())
     facts = importlib.import_module(f"flashdex.hands.{name}")
     return {side: _make_spec(name, side, facts) for side in SIDES}
 
 
 def _make_spec(name: str, side: Side, facts: ModuleType) -> HandSpec:
-    file = resources.files(facts) / f"{side}.xml"
+    file = Path(str(facts.__file__)).with_name(f"{side}.xml")
     mjcf = file.read_text()
     model = mujoco.MjSpec.from_string(mjcf).compile()
     _refuse_unsupported(model, where=str(file))

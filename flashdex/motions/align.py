@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -18,53 +19,25 @@ from flashdex.datasets.tracks import (
     transform_pose,
 )
 from flashdex.keys import SIDES
-from flashdex.motions.contact.fingertips import (
-    NO_OBJECT,
-    assign_object,
-    contact_runs,
-    tip_distances,
-)
-from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.objects.meshes import clean_mesh, hull_vertices
 
 
 @dataclass
 class AlignedDemo:
-    """Tracks of one motion at the control rate, [left, right]; absent hands are zero.
-
-    Args:
-        name: of the motion.
-        fps: control rate.
-        keypoints: m, (T, 2, 21, 3).
-        palm: (T, 2, 7).
-        present: hands that were recorded, (2,).
-        active: hands that touch an object, (2,).
-        hand_object: slot of each hand's object, -1 for none, (2,).
-        tip_dist: to the surface of that object, m, (T, 2, 5).
-        contact: fingers in contact, (T, 2, 5) bool.
-        poses: per slot (T, 7).
-        meshes: per slot.
-        object_names: per slot.
-        support_z: height of the table in the recording, m.
-        support_found: whether it comes from rest or the reader, not from a guess.
-        left_out: poses (T, 7) of objects that found no slot, by name.
-    """
+    """Tracks of one motion at the control rate; absent hands are zero."""
 
     name: str
     fps: float
-    keypoints: np.ndarray
-    palm: np.ndarray
-    present: np.ndarray
-    active: np.ndarray
-    hand_object: np.ndarray
-    tip_dist: np.ndarray
-    contact: np.ndarray
-    poses: list[np.ndarray]
-    meshes: list[trimesh.Trimesh]
+    up: Literal["z", "y", "-y"]  # of the recording; only to name axes in its own world
+    keypoints: np.ndarray  # [left, right], m, (T, 2, 21, 3)
+    palm: np.ndarray  # (T, 2, 7)
+    present: np.ndarray  # hands that were recorded, (2,)
+    told: np.ndarray  # object that the recording says each hand uses, -1 for none, (2,)
+    poses: list[np.ndarray]  # per object (T, 7)
+    meshes: list[trimesh.Trimesh]  # per object, cleaned
     object_names: list[str]
-    support_z: float
-    support_found: bool
-    left_out: dict[str, np.ndarray] = field(default_factory=dict)
+    support_z: float  # height of the table in the recording, m
+    support_found: bool  # whether it comes from rest or the reader, not from a guess
 
     @property
     def num_frames(self) -> int:
@@ -73,12 +46,7 @@ class AlignedDemo:
 
 
 def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
-    """Turn up, shift the table to z = 0, resample, and find out who touches what.
-
-    Args:
-        demo: validated.
-        control_hz: frames a second of the result.
-    """
+    """Turn a validated demonstration up, shift the table to z = 0, and resample."""
     meshes = [clean_mesh(body.load_mesh(), name=body.name) for body in demo.objects]
     turn = Rotation.from_euler("x", UP_ROTATION[demo.up])
     poses = [transform_pose(b.pose, turn) for b in demo.objects]
@@ -92,27 +60,19 @@ def align(demo: HumanDemo, *, control_hz: float) -> AlignedDemo:
     for pose in poses:
         pose[:, :3] += lift
     keypoints, palm = _hands(demo, turn, times, lift)
-    present = np.array([side in demo.keypoints for side in SIDES])
-    roles = _assign(demo, keypoints, present, poses, meshes, control_hz)
-    tip_dist, slots, chosen = roles.tip_dist, roles.kept, roles.chosen
-    contact = np.stack([contact_runs(tip_dist[:, h], control_hz) for h in range(2)], 1)
-    used = np.array([slots.index(chosen[h]) if h in chosen else -1 for h in range(2)])
     return AlignedDemo(
         name=demo.name,
         fps=control_hz,
+        up=demo.up,
         keypoints=keypoints,
         palm=palm,
-        present=present,
-        active=present & contact.any(axis=(0, 2)),
-        hand_object=used,
-        tip_dist=tip_dist,
-        contact=contact,
-        poses=[poses[i] for i in slots],
-        meshes=[meshes[i] for i in slots],
-        object_names=[demo.objects[i].name for i in slots],
+        present=np.array([side in demo.keypoints for side in SIDES]),
+        told=np.array([demo.hand_object.get(side, -1) for side in SIDES]),
+        poses=poses,
+        meshes=meshes,
+        object_names=[body.name for body in demo.objects],
         support_z=float(height),
         support_found=found,
-        left_out={demo.objects[i].name: poses[i] for i in roles.left_out},
     )
 
 
@@ -133,48 +93,3 @@ def _hands(
         palm[:, hand, :3] += lift
         palm[:, hand, 3:] = continuous(palm[:, hand, 3:])
     return keypoints, palm
-
-
-@dataclass
-class _Roles:
-    """Objects kept (rows of the demo), each hand's object, and its tip distances."""
-
-    kept: list[int]
-    left_out: list[int]
-    chosen: dict[int, int]
-    tip_dist: np.ndarray
-
-
-def _assign(
-    demo: HumanDemo,
-    keypoints: np.ndarray,
-    present: np.ndarray,
-    poses: list[np.ndarray],
-    meshes: list[trimesh.Trimesh],
-    fps: float,
-) -> _Roles:
-    """Give slots to what hands touch longest, then to what moves most.
-
-    An idle hand is given the object nearest to it for its distances, but no slot.
-    """
-    touched = np.zeros(len(poses), dtype=int)  # frames
-    chosen: dict[int, int] = {}
-    tip_dist = np.full((len(keypoints), 2, 5), NO_OBJECT)
-    for hand in np.flatnonzero(present):
-        side = SIDES[hand]
-        told = demo.hand_object.get(side)
-        options = range(len(poses)) if told is None else [told]
-        near = [tip_distances(keypoints[:, hand], poses[i], meshes[i]) for i in options]
-        runs = [contact_runs(d, fps).any(axis=1).sum() for d in near]
-        best = assign_object(near)
-        tip_dist[:, hand] = near[best]
-        touched[list(options)] += runs
-        if told is not None or runs[best]:
-            chosen[int(hand)] = options[best]
-    used = set(chosen.values())
-    travel = [float(np.ptp(p[:, :3], axis=0).max()) for p in poses]
-    order = sorted(
-        range(len(poses)), key=lambda i: (i not in used, -touched[i], -travel[i])
-    )
-    kept = sorted(order[:NUM_OBJECT_SLOTS])
-    return _Roles(kept, order[NUM_OBJECT_SLOTS:], chosen, tip_dist)

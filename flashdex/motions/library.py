@@ -17,19 +17,10 @@ from flashdex.errors import LibraryError, nearest
 SCHEMA = 1
 NUM_OBJECT_SLOTS = 2
 FRAME_KEYS = (
-    "joint_pos",
-    "joint_vel",
-    "wrist_pos",
-    "wrist_quat",
-    "wrist_linvel",
-    "wrist_angvel",
-    "keypoints",
-    "keypoint_linvel",
-    "tip_dist",
-    "object_pos",
-    "object_quat",
-    "object_linvel",
-    "object_angvel",
+    *("joint_pos", "joint_vel"),
+    *("wrist_pos", "wrist_quat", "wrist_linvel", "wrist_angvel"),
+    *("keypoints", "keypoint_linvel", "tip_dist"),
+    *("object_pos", "object_quat", "object_linvel", "object_angvel"),
 )
 # How good the reference is, frame by frame; for reports, no training reads it.
 QUALITY_KEYS = ("tip_error", "penetration", "contact")
@@ -42,15 +33,9 @@ class MotionLibrary:
     ``frames`` (F,), ``motions`` (M,) and ``objects`` (Q,) are memory-mapped; motion
     ``m`` owns the rows ``start[m] ... start[m] + length[m] - 1`` of ``frames``.
 
-    Args:
-        path: the library's directory.
-        frames: one row a frame.
-        motions: one row a motion.
-        objects: one row an object.
-        manifest: names, sources, licences, hashes, versions.
-        quality: one row a frame: ``tip_error`` (2, 5), m, robot pad to human tip;
-            ``penetration`` (), m, deepest contact of a hand with an object;
-            ``contact`` (2, 5), human fingers in contact. None in older libraries.
+    ``quality`` has a row a frame: ``tip_error`` (2, 5), m, robot pad to human tip;
+    ``penetration`` (), m, deepest contact of a hand with an object; ``contact`` (2, 5),
+    human fingers in contact. It is None in older libraries.
 
     Example:
         >>> library = MotionLibrary.load("libraries/quickstart")  # doctest: +SKIP
@@ -61,15 +46,12 @@ class MotionLibrary:
     frames: TensorDict
     motions: TensorDict
     objects: TensorDict
-    manifest: dict[str, Any]
+    manifest: dict[str, Any]  # names, sources, licences, hashes, versions
     quality: TensorDict | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> MotionLibrary:
-        """Open a library.
-
-        Args:
-            path: directory written by ``prepare``.
+        """Open a directory that ``prepare`` wrote.
 
         Raises:
             LibraryError: if it is missing, incomplete or of another schema.
@@ -77,14 +59,13 @@ class MotionLibrary:
         path = Path(path)
         manifest = _read_manifest(path)
         parts = {}
-        for part in ("frames", "motions", "objects"):
-            if not (path / part / "meta.json").is_file():
+        for part in ("frames", "motions", "objects", "quality"):
+            if (path / part / "meta.json").is_file():
+                parts[part] = TensorDict.load_memmap(path / part)
+            elif part != "quality":
                 raise LibraryError(
                     f"{path}: '{part}' is missing. Prepare it again: flashdex prepare"
                 )
-            parts[part] = TensorDict.load_memmap(path / part)
-        if (path / "quality" / "meta.json").is_file():
-            parts["quality"] = TensorDict.load_memmap(path / "quality")
         library = cls(path=path, manifest=manifest, **parts)
         library._check()
         return library

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,17 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
 from flashdex.keys import FINGERS, SIDES
-from flashdex.motions.library import FRAME_KEYS, QUALITY_KEYS, SCHEMA
+from flashdex.motions.library import (
+    FRAME_KEYS,
+    QUALITY_KEYS,
+    SCHEMA,
+)
 from flashdex.objects.asset import ObjectAsset
 
 # what is no part of the name of a folder, and how long one may be
 NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
+OBJECT_KEYS = ("points", "normals", "radius", "sdf", "sdf_origin", "sdf_spacing")
+OBJECT_KEYS += ("mass", "com", "inertia", "aabb")
 CONVENTIONS = {
     "units": {"length": "m", "angle": "rad", "time": "s", "mass": "kg"},
     "up": "z",
@@ -35,26 +42,17 @@ CONVENTIONS = {
 
 @dataclass
 class MotionRecord:
-    """One prepared motion, as it goes into the library.
+    """One prepared motion, as it goes into the library."""
 
-    Args:
-        name: unique in the library.
-        frames: every key of ``FRAME_KEYS``, (T, ...).
-        hand_active: which hands take part, [left, right].
-        hand_object: object slot of each hand, -1 for none.
-        objects: objects by slot; at most as many as there are slots.
-        support_disks: [x, y, z_top, radius, height], m, NaN unused, (4, 5).
-        info: what the manifest says about it (source, licence, status, figures).
-        quality: every key of ``QUALITY_KEYS``, (T, ...), or nothing.
-    """
-
-    name: str
-    frames: dict[str, np.ndarray]
-    hand_active: tuple[bool, bool]
-    hand_object: tuple[int, int]
-    objects: list[ObjectAsset]
-    support_disks: np.ndarray
+    name: str  # unique in the library
+    frames: dict[str, np.ndarray]  # every key of FRAME_KEYS, (T, ...)
+    hand_active: tuple[bool, bool]  # which hands take part, [left, right]
+    hand_object: tuple[int, int]  # object slot of each hand, -1 for none
+    objects: list[ObjectAsset]  # by slot; at most as many as there are slots
+    support_disks: np.ndarray  # [x, y, z_top, radius, height], m, NaN unused, (4, 5)
+    # what the manifest says about it: source, licence, status, figures
     info: dict[str, Any] = field(default_factory=dict)
+    # every key of QUALITY_KEYS, (T, ...), or nothing
     quality: dict[str, np.ndarray] = field(default_factory=dict)
 
 
@@ -62,13 +60,8 @@ class LibraryWriter:
     """Collects motions and writes them as one library directory.
 
     Everything is written to a temporary folder beside the target and renamed at the
-    end, so that a killed run leaves no library and an old one stays as it was.
-
-    Args:
-        path: directory of the library.
-        hand: robot hand of the joint references.
-        fps: control rate of all motions.
-        manifest: more entries of the manifest (settings, versions, source).
+    end, so that a killed run leaves no library and an old one stays as it was. The
+    manifest may be given more entries (settings, versions, source).
     """
 
     def __init__(
@@ -97,10 +90,7 @@ class LibraryWriter:
         self._records.append(record)
 
     def write(self, *, report: str = "") -> Path:
-        """Write the library, replacing one of the same name.
-
-        Args:
-            report: content of report.csv.
+        """Write the library, with ``report`` as report.csv; replaces one of its name.
 
         Raises:
             LibraryError: when there is nothing to write or the disk refuses; nothing
@@ -108,37 +98,33 @@ class LibraryWriter:
         """
         if not self._records:
             raise LibraryError(f"{self.path}: no motion was kept; nothing to write.")
-        work = None
+        name, folder = self.path.name, self.path.parent
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            prefix = f".{self.path.name}-"
-            work = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
-            self._fill(work, report)
-            _swap(work, self.path)
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(
+                prefix=f".{name}-", dir=folder, ignore_cleanup_errors=True
+            ) as work:
+                self._fill(Path(work), report)
+                _swap(Path(work), self.path)
         except (OSError, RuntimeError) as error:
             raise LibraryError(
                 f"{self.path}: could not write the library ({error}). Check free "
-                f"space and permissions of {self.path.parent}."
+                f"space and permissions of {folder}."
             ) from error
-        finally:
-            if work is not None:
-                shutil.rmtree(work, ignore_errors=True)
         return self.path
 
     def _fill(self, work: Path, report: str) -> None:
         os.chmod(work, 0o755)  # mkdtemp makes it private
-        names = _unique_names(list(self._objects.values()))
-        files = [
-            _write_meshes(work, name, asset)
-            for name, asset in zip(names, self._objects.values(), strict=True)
-        ]
+        assets = list(self._objects.values())
+        names = _unique_names(assets)
+        files = [_write_meshes(work, *pair) for pair in zip(names, assets, strict=True)]
         tables = {
-            "frames": self._stack_frames(),
+            "frames": self._stack_rows("frames", FRAME_KEYS).float(),
             "motions": self._stack_motions(),
-            "objects": _stack_objects(list(self._objects.values())),
+            "objects": _stack_objects(assets),
         }
         if all(r.quality for r in self._records):
-            tables["quality"] = self._stack_quality()
+            tables["quality"] = self._stack_rows("quality", QUALITY_KEYS)
         # Writing to a mapped file on a full disk kills the process: ask beforehand.
         needed = sum(table.bytes() for table in tables.values())
         free = shutil.disk_usage(work).free
@@ -152,7 +138,7 @@ class LibraryWriter:
             "motions": [{"name": r.name, **r.info} for r in self._records],
             "objects": [
                 {"name": n, "sha256": a.sha256, "watertight": bool(a.watertight), **f}
-                for n, a, f in zip(names, self._objects.values(), files, strict=True)
+                for n, a, f in zip(names, assets, files, strict=True)
             ],
         }
         # names of files and texts in them may hold what is no character
@@ -161,20 +147,12 @@ class LibraryWriter:
         text = json.dumps(manifest, indent=1)
         (work / "manifest.json").write_text(text, encoding="utf-8")
 
-    def _stack_frames(self) -> TensorDict:
-        stacked = {
-            k: np.concatenate([r.frames[k] for r in self._records]) for k in FRAME_KEYS
-        }
-        total = len(stacked["joint_pos"])
-        tensors = {k: torch.as_tensor(v).float() for k, v in stacked.items()}
-        return TensorDict(tensors, batch_size=[total])
-
-    def _stack_quality(self) -> TensorDict:
-        tensors = {
-            k: torch.as_tensor(np.concatenate([r.quality[k] for r in self._records]))
-            for k in QUALITY_KEYS
-        }
-        return TensorDict(tensors, batch_size=[len(tensors["contact"])])
+    def _stack_rows(self, part: str, keys: Iterable[str]) -> TensorDict:
+        """Frames of all motions on one axis."""
+        rows = [getattr(record, part) for record in self._records]
+        columns = {k: np.concatenate([row[k] for row in rows]) for k in keys}
+        tensors = {k: torch.as_tensor(v) for k, v in columns.items()}
+        return TensorDict(tensors).auto_batch_size_(1)
 
     def _stack_motions(self) -> TensorDict:
         lengths = torch.tensor([len(r.frames["joint_pos"]) for r in self._records])
@@ -199,19 +177,10 @@ class LibraryWriter:
 
 
 def _stack_objects(assets: list[ObjectAsset]) -> TensorDict:
-    fields = {
-        "points": [a.points for a in assets],
-        "normals": [a.normals for a in assets],
-        "radius": [a.radius for a in assets],
-        "sdf": [a.sdf for a in assets],
-        "sdf_origin": [a.sdf_origin for a in assets],
-        "sdf_spacing": [a.sdf_spacing for a in assets],
-        "mass": [a.mass for a in assets],
-        "com": [a.com for a in assets],
-        "inertia": [a.inertia for a in assets],
-        "aabb": [a.aabb for a in assets],
+    stacked = {
+        key: torch.as_tensor(np.stack([getattr(a, key) for a in assets])).float()
+        for key in OBJECT_KEYS
     }
-    stacked = {k: torch.as_tensor(np.stack(v)).float() for k, v in fields.items()}
     return TensorDict(stacked, batch_size=[len(assets)])
 
 
@@ -235,17 +204,13 @@ def _write_meshes(work: Path, name: str, asset: ObjectAsset) -> dict[str, Any]:
     for i, part in enumerate(asset.parts):
         file = folder / f"part_{i:03d}.obj"
         hull = trimesh.convex.convex_hull(part)
-        _write_obj(work / file, part, _faces_of(hull, part))
+        # its faces, of the part's vertices in the order that they have
+        gaps = np.linalg.norm(hull.vertices[:, None] - part[None], axis=-1)
+        _write_obj(work / file, part, gaps.argmin(axis=1)[hull.faces])
         parts.append(str(file))
     visual = folder / "visual.obj"
     _write_obj(work / visual, asset.visual_vertices, asset.visual_faces)
     return {"parts": parts, "visual": str(visual)}
-
-
-def _faces_of(hull: trimesh.Trimesh, vertices: np.ndarray) -> np.ndarray:
-    """Faces of a convex hull, indexed into ``vertices`` (which keep their order)."""
-    gaps = np.linalg.norm(hull.vertices[:, None] - vertices[None], axis=-1)
-    return gaps.argmin(axis=1)[hull.faces]
 
 
 def _write_obj(file: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

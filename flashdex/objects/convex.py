@@ -29,17 +29,10 @@ def compute_convex_parts(
     seed: int,
     name: str,
 ) -> list[NDArray[np.float32]]:
-    """Cover a mesh with convex hulls by CoACD.
+    """Cover a cleaned mesh with convex hulls by CoACD; ``name`` is for messages.
 
-    A mesh whose volume is within 1 % of its hull's is its own single part.
-
-    Args:
-        mesh: cleaned triangles, m.
-        max_parts: most parts.
-        threshold: concavity that CoACD leaves in a part.
-        max_vertices: most vertices a part.
-        seed: of CoACD's search.
-        name: file or object, for messages.
+    A mesh whose volume is within 1 % of its hull's is its own single part; the other
+    arguments are those of :class:`flashdex.objects.asset.ObjectSettings`.
 
     Returns:
         Vertices of each hull in the object frame, m, float32, each (V, 3), largest
@@ -47,13 +40,9 @@ def compute_convex_parts(
     """
     whole = mesh.convex_hull
     convex = mesh.is_volume and mesh.volume > (1 - CONVEX_TOLERANCE) * whole.volume
-    found = []
-    if not convex and max_parts > 1:
-        found = _run_coacd(
-            mesh, max_parts=max_parts, threshold=threshold, seed=seed, name=name
-        )
     hulls = []
-    for vertices in found:
+    split = not convex and max_parts > 1
+    for vertices in _run_coacd(mesh, max_parts, threshold, seed, name) if split else []:
         try:
             hull = ConvexHull(vertices)
         except QhullError:
@@ -67,7 +56,7 @@ def compute_convex_parts(
 
 
 def _run_coacd(
-    mesh: trimesh.Trimesh, *, max_parts: int, threshold: float, seed: int, name: str
+    mesh: trimesh.Trimesh, max_parts: int, threshold: float, seed: int, name: str
 ) -> list[NDArray[np.float64]]:
     import coacd  # loads a native library; only needed when nothing is cached
 
@@ -118,16 +107,15 @@ def compute_mass_properties(
         mesh: cleaned triangles, m.
         parts: hull vertices, m, each (V, 3).
         density: kg/m^3.
-        mass_limits: smallest and largest mass, kg.
+        mass_limits: kg.
 
     Returns:
         Mass, kg; centre of mass in the object frame, m, (3,); inertia about the centre
         of mass in object axes, kg m^2, (3, 3), positive definite with every moment
         below the sum of the other two.
     """
-    solids = (
-        [mesh] if mesh.is_volume else [trimesh.convex.convex_hull(p) for p in parts]
-    )
+    hulls = map(trimesh.convex.convex_hull, parts)
+    solids = [mesh] if mesh.is_volume else list(hulls)
     volumes = np.array([s.volume for s in solids])
     centres = np.array([s.center_mass for s in solids])
     volume = float(volumes.sum())

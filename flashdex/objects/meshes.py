@@ -23,15 +23,9 @@ SAMPLES_PER_POINT = 64  # density of the sample that farthest points are chosen 
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh:
-    """Read one mesh of one file.
+    """Read a file of ``MESH_SUFFIXES`` as one mesh, not cleaned; its unit is the metre.
 
     Scenes become one mesh, each geometry moved by the transform of its node.
-
-    Args:
-        path: mesh file (``MESH_SUFFIXES``); its unit is taken to be the metre.
-
-    Returns:
-        The mesh as stored, not cleaned.
 
     Raises:
         MeshError: the file is missing or cannot be read.
@@ -49,10 +43,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
-        raise MeshError(
-            f"{path}: not readable as a mesh ({error}). "
-            f"Allowed: {', '.join(MESH_SUFFIXES)}."
-        ) from error
+        text = f"{path}: not readable as a mesh ({error}). Allowed: "
+        raise MeshError(f"{text}{', '.join(MESH_SUFFIXES)}.") from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -68,17 +60,11 @@ def _refuse_large(scene: trimesh.Scene) -> None:
 
 
 def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
-    """Check a mesh and repair what can be repaired without changing its shape.
+    """A mesh (m) with what can be repaired without changing its shape; a new one.
 
     Merges vertices, drops faces without area and loose components below 1 % of the
-    area, makes the winding consistent and outward, closes small holes.
-
-    Args:
-        mesh: as loaded, m.
-        name: file or object, for messages.
-
-    Returns:
-        A new mesh; it may still have holes.
+    area, makes the winding consistent and outward, closes small holes; others stay.
+    The name, of a file or object, is for messages.
 
     Raises:
         MeshError: nothing to simulate: empty, too few vertices, not finite, flat, or
@@ -102,11 +88,7 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
 
 
 def hull_vertices(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """Vertices of the convex hull, m, (V, 3): all that touches a table is among them.
-
-    Args:
-        mesh: with a hull of some volume.
-    """
+    """Vertices of the convex hull, m, (V, 3): all that can touch a table."""
     return np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
 
 
@@ -123,11 +105,9 @@ def _refuse_unusable(mesh: trimesh.Trimesh, name: str) -> None:
         raise MeshError(f"{name}: {distinct} distinct vertices; a solid needs 4.")
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        hint = (
-            "Are they centimetres (scale by 0.01) or millimetres (0.001)?"
-            if extent > MAX_EXTENT
-            else "Are they of another unit?"
-        )
+        hint = "Are they of another unit?"
+        if extent > MAX_EXTENT:
+            hint = "Are they centimetres (scale by 0.01) or millimetres (0.001)?"
         raise MeshError(
             f"{name}: the mesh is {extent:.4g} m long; allowed are {MIN_EXTENT} m to "
             f"{MAX_EXTENT} m. Vertices must be metres. {hint}"
@@ -160,16 +140,13 @@ def _drop_loose_components(mesh: trimesh.Trimesh) -> None:
 
 
 def reduce_mesh(mesh: trimesh.Trimesh, *, max_faces: int) -> trimesh.Trimesh:
-    """Fewer faces, for drawing: vertices that share a cell become their mean.
+    """Fewer faces: vertices that share a cell become their mean.
 
-    Args:
-        mesh: any triangles, m.
-        max_faces: the limit; a mesh within it is returned as it is.
+    A mesh within the limit is returned as it is.
     """
     if len(mesh.faces) <= max_faces:
         return mesh
-    extent = float(mesh.extents.max())
-    low, high = extent / 512, extent / 4
+    low, high = np.array([1 / 512, 1 / 4]) * float(mesh.extents.max())
     best = _cluster(mesh, high)
     for _ in range(10):
         cell = np.sqrt(low * high)
@@ -185,10 +162,8 @@ def _cluster(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
     key = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
     _, group = np.unique(key, axis=0, return_inverse=True)
     group = group.ravel()
-    count = np.bincount(group)[:, None]
-    mean = (
-        np.stack([np.bincount(group, weights=x) for x in mesh.vertices.T], -1) / count
-    )
+    sums = np.stack([np.bincount(group, weights=x) for x in mesh.vertices.T], -1)
+    mean = sums / np.bincount(group)[:, None]
     merged = trimesh.Trimesh(mean, group[mesh.faces], process=False)
     merged.update_faces(merged.nondegenerate_faces() & merged.unique_faces())
     merged.remove_unreferenced_vertices()
@@ -196,11 +171,7 @@ def _cluster(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
 
 
 def join_meshes(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh with the triangles of all parts; nothing is merged or cut.
-
-    Args:
-        parts: at least one mesh, in a common frame, m.
-    """
+    """One mesh with the triangles of all parts; nothing is merged or cut."""
     mesh = trimesh.util.concatenate(list(parts))
     assert isinstance(mesh, trimesh.Trimesh)
     return mesh
@@ -219,8 +190,8 @@ def sample_surface_points(
     Returns:
         Points, m, (P, 3), and unit normals of their triangles, (P, 3).
     """
-    count_dense = SAMPLES_PER_POINT * count
-    dense, face, *_ = trimesh.sample.sample_surface(mesh, count_dense, seed=seed)
+    number = SAMPLES_PER_POINT * count
+    dense, face, *_ = trimesh.sample.sample_surface(mesh, number, seed=seed)
     dense = np.asarray(dense)
     order = farthest_point_sampling(torch.from_numpy(dense), count).numpy()
     normals = mesh.face_normals[face[order]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -18,35 +17,24 @@ NODE_CHUNK = 16384  # nodes whose candidate triangles are held in memory at once
 WINDING_PAIRS = 4_000_000  # node-triangle pairs held in memory at once
 
 
-@dataclass(frozen=True)
-class DistanceGrid:
-    """Signed distances at the nodes of a cubic grid, in the mesh's frame.
-
-    Attributes:
-        values: m, negative inside, float32, (R, R, R), axes x, y, z.
-        origin: node (0, 0, 0), m, (3,).
-        spacing: node spacing, m.
-    """
-
-    values: NDArray[np.float32]
-    origin: Array
-    spacing: float
-
-
 def make_distance_grid(
     mesh: trimesh.Trimesh, *, resolution: int, margin: float, watertight: bool
-) -> DistanceGrid:
-    """Sample the signed distance on a cube around the mesh.
+) -> tuple[NDArray[np.float32], Array, float]:
+    """Sample the signed distance on a cube around the mesh, in the mesh's frame.
 
     Distances are exact point-triangle distances (see :func:`surface_distance`); the
     sign is that of the generalised winding number minus one half.
 
     Args:
-        mesh: triangles in the object frame, m; needs no watertightness.
+        mesh: triangles, m; needs no watertightness.
         resolution: nodes along each axis, R.
         margin: room between the bounding box and the cube, m.
         watertight: whether the surface is closed, so that one sign serves each region
             it bounds; otherwise every node in the bounding box decides alone.
+
+    Returns:
+        Values at the nodes, m, negative inside, (R, R, R), axes x, y, z; node
+        (0, 0, 0), m, (3,); node spacing, m.
     """
     low, high = mesh.bounds
     side = float((high - low).max()) + 2 * margin
@@ -59,10 +47,11 @@ def make_distance_grid(
     distance = distance.reshape(nodes.shape[:3])
     if watertight:
         inside = _inside_by_component(triangles, nodes, distance, spacing)
-    else:
-        inside = _inside_by_node(triangles, nodes, mesh.bounds)
+    else:  # holes join inside and outside
+        inside = ((nodes > low) & (nodes < high)).all(axis=-1)
+        inside[inside] = winding_number(triangles, nodes[inside]) > 0.5
     values = np.where(inside, -distance, distance).astype(np.float32)
-    return DistanceGrid(values=values, origin=origin, spacing=spacing)
+    return values, origin, spacing
 
 
 def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Array:
@@ -79,9 +68,6 @@ def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Ar
         mesh: triangles, m.
         points: m, (N, 3).
         step: largest distance between neighbouring samples, m.
-
-    Returns:
-        Distance, m, (N,).
     """
     area = mesh.area_faces
     faces = mesh.faces[area > 1e-12 * area.max()]
@@ -112,9 +98,6 @@ def winding_number(triangles: Array, points: Array) -> Array:
     Args:
         triangles: m, (F, 3, 3), counter-clockwise seen from outside.
         points: m, (N, 3).
-
-    Returns:
-        (N,).
     """
     centre = triangles.reshape(-1, 3).mean(axis=0)
     corners = (triangles - centre).astype(np.float32)
@@ -153,14 +136,6 @@ def _inside_by_component(
     return np.where(far, sign[regions], inside)
 
 
-def _inside_by_node(triangles: Array, nodes: Array, bounds: Array) -> NDArray[np.bool_]:
-    # Holes join inside and outside, so every node of the bounding box decides alone.
-    box = ((nodes > bounds[0]) & (nodes < bounds[1])).all(axis=-1)
-    inside = np.zeros(nodes.shape[:3], dtype=bool)
-    inside[box] = winding_number(triangles, nodes[box]) > 0.5
-    return inside
-
-
 def _surface_samples(
     vertices: Array, faces: NDArray[np.int64], step: float
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], float]:
@@ -168,11 +143,8 @@ def _surface_samples(
     corners = vertices[faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=-1)
     pieces = np.ceil(edge / step).astype(np.int64).clip(1)
-    points, ids, owners = (
-        [vertices],
-        [faces.ravel()],
-        [np.repeat(np.arange(len(faces)), 3)],
-    )
+    points, ids = [vertices], [faces.ravel()]
+    owners = [np.repeat(np.arange(len(faces)), 3)]
     count = len(vertices)
     for n in np.unique(pieces[pieces > 1]):
         i, j = (g.ravel() for g in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))

@@ -10,20 +10,14 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-import flashdex.hands
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.envs.mdp.term import KINDS as TERM_KINDS
 from flashdex.envs.mdp.term import default_mapping, registry, terms_of
 from flashdex.errors import FlashdexError, nearest
+from flashdex.hands.spec import known_hands
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
-
-
-def known_hands() -> list[str]:
-    """Return the names of the built-in hands (folders with a left and a right MJCF)."""
-    root = Path(flashdex.hands.__path__[0])
-    return sorted(path.parent.name for path in root.glob("*/left.xml"))
 
 
 def find_conflicts(recipe: Recipe) -> list[str]:

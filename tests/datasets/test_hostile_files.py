@@ -22,8 +22,8 @@ from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions.library_writer import LibraryWriter, _unique_names
 from flashdex.motions.pipeline import cache as motion_cache
-from flashdex.motions.pipeline.jobs import Job, run_job
 from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.workers import Job, run_job
 from flashdex.objects import meshes
 from flashdex.objects.asset import ObjectSettings, make_object
 from flashdex.objects.meshes import load_mesh

@@ -23,9 +23,8 @@ from flashdex.errors import FlashdexError
 from flashdex.hands.collision_spheres import HandModel
 from flashdex.motions.checks.recording import TRAVEL
 from flashdex.motions.pipeline import motion as process
-from flashdex.motions.pipeline.jobs import prepare_recording
-from flashdex.motions.pipeline.motion import MotionSettings
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.motions.pipeline.motion import MotionSettings, prepare_recording
+from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.motions.repair.jumps import JUMP_SPEED
 from flashdex.motions.retarget.penetration import Penetration
 from flashdex.motions.retarget.starts import Attempt, Choice
@@ -88,7 +87,7 @@ def _no_waiting():
 @pytest.fixture
 def run(shared, tmp_path, monkeypatch):
     """Write a case and prepare it without inverse kinematics: outcomes, or None."""
-    monkeypatch.setattr(process, "_retarget", rest)
+    monkeypatch.setattr(process, "retarget", rest)
 
     def run(case):
         kept, mano = LAYOUTS[case.layout], shared / "mano"
@@ -111,7 +110,7 @@ def run(shared, tmp_path, monkeypatch):
     return run
 
 
-def rest(aligned, assets, specs, settings):
+def rest(aligned, assets, specs, **_):
     """In place of inverse kinematics: hands with every joint in its middle."""
     frames = aligned.num_frames
     middle = np.stack([specs[side].joint_range.mean(-1) for side in ("left", "right")])
@@ -238,15 +237,11 @@ def test_library_holds_only_the_good_ones(tmp_path):
     (folder / "folder.npz").mkdir()
     (folder / "broken_link.npz").symlink_to(tmp_path / "nowhere.npz")
     before = sorted(tmp_path.rglob("*"))
-    library = prepare(
-        "keypoints",
-        folder,
-        out=tmp_path / "out" / "library",
-        control_hz=15.0,
-        objects=QUICK,
-        cache_dir=tmp_path / "cache",
-        progress=False,
+    settings = MotionSettings(
+        control_hz=15.0, objects=QUICK, cache_dir=tmp_path / "cache"
     )
+    order = Order("keypoints", SourceOptions(path=folder), settings)
+    library = run_order(order, tmp_path / "out" / "library", progress=False)
     assert library.names == ["good"]
     with open(library.path / "report.csv", encoding="utf-8", newline="") as file:
         rows = {row["motion"]: row for row in csv.DictReader(file)}
@@ -268,16 +263,12 @@ def test_objects_of_any_name_stay_inside_the_library(tmp_path, shared):
     data["motion_intent"] = np.array("=1+2", dtype=object)
     np.savez(file, **data)
     before = sorted(tmp_path.rglob("*"))
-    library = prepare(
-        "grab",
-        tmp_path / "in",
-        out=tmp_path / "out" / "library",
-        mano=shared / "mano",
-        control_hz=15.0,
-        objects=QUICK,
-        cache_dir=tmp_path / "cache",
-        progress=False,
+    settings = MotionSettings(
+        control_hz=15.0, objects=QUICK, cache_dir=tmp_path / "cache"
     )
+    options = SourceOptions(path=tmp_path / "in", mano=shared / "mano")
+    order = Order("grab", options, settings)
+    library = run_order(order, tmp_path / "out" / "library", progress=False)
     meshes = [
         p for o in library.manifest["objects"] for p in (o["visual"], *o["parts"])
     ]

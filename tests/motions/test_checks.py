@@ -9,15 +9,12 @@ from flashdex.datasets.procedural.reader import procedural
 from flashdex.motions.align import align
 from flashdex.motions.checks.aligned import check_aligned, check_up
 from flashdex.motions.checks.objects import check_objects, check_overlap
-from flashdex.motions.checks.recording import Finding, make_strict, status_of
 from flashdex.motions.contact.fingertips import tip_distances
+from flashdex.motions.contact.roles import find_roles
+from flashdex.motions.findings import Finding, make_strict, status_of
 from flashdex.motions.repair.jumps import outliers
-from flashdex.objects.asset import (
-    ObjectAsset,
-    ObjectSettings,
-    make_object,
-    make_slot_grid,
-)
+from flashdex.objects.asset import ObjectAsset, ObjectSettings, make_object
+from flashdex.objects.solid import make_slot_grid
 from flashdex.objects.symmetry import revolution_axis
 
 FPS = 60.0
@@ -210,7 +207,7 @@ def test_a_shelf_and_a_held_object_are_no_reason():
 def aligned_of(change_demo, tmp):
     demo = procedural(0, kinds=["pick_box_right"])[0]
     change_demo(demo)
-    aligned = align(demo, control_hz=30.0)
+    aligned = find_roles(align(demo, control_hz=30.0))
     assets = [
         make_object(m, settings=QUICK, cache_dir=tmp, name=n)
         for m, n in zip(aligned.meshes, aligned.object_names, strict=True)

@@ -12,7 +12,9 @@ from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
-from flashdex.motions.checks.recording import check_company, check_demo, check_sides
+from flashdex.motions.checks.aligned import check_company
+from flashdex.motions.checks.recording import check_demo, check_sides
+from flashdex.motions.contact.roles import find_roles
 from flashdex.motions.repair.repair import repair
 
 
@@ -49,7 +51,7 @@ def test_hands_that_come_late_are_flagged(demo, late, wanted):
     first = demo.objects[0]
     early = np.concatenate([first.pose[late:], np.repeat(first.pose[-1:], late, 0)])
     demo.objects[0] = DemoObject(first.name, first.mesh, early)
-    found = check_company(align(demo, control_hz=30.0))
+    found = check_company(find_roles(align(demo, control_hz=30.0)))
     assert [f.code for f in found] == wanted
 
 
@@ -86,7 +88,7 @@ def test_recorded_hands_have_the_right_side_and_company(demos):
     for file in sorted((demos / "taco").glob("*.npz")):
         (demo,) = read_keypoints(file)
         assert check_sides(demo) == []
-        assert check_company(align(demo, control_hz=30.0)) == []
+        assert check_company(find_roles(align(demo, control_hz=30.0))) == []
 
 
 def test_entries_of_another_kind_are_named():

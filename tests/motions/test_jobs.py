@@ -13,11 +13,11 @@ from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.motions.align import align
-from flashdex.motions.checks.aligned import _check_left_out
-from flashdex.motions.pipeline.jobs import Job, run_job
+from flashdex.motions.checks.aligned import check_left_out
+from flashdex.motions.contact.roles import find_roles
 from flashdex.motions.pipeline.motion import MotionSettings
-from flashdex.motions.pipeline.prepare import Order, hash_inputs, prepare, run_order
-from flashdex.motions.pipeline.workers import run_jobs
+from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
+from flashdex.motions.pipeline.workers import Job, run_job, run_jobs
 from flashdex.motions.repair.repair import repair
 from flashdex.objects.asset import ObjectSettings
 
@@ -146,17 +146,15 @@ def test_worker_that_dies_costs_its_recording_only(settings, recording):
 def test_two_workers_write_the_library_of_one(tmp_path):
     made = []
     for workers in (1, 2):
-        library = prepare(
+        order = Order(
             "procedural",
-            "pick_box_right,pick_cylinder_left",
-            out=tmp_path / f"library{workers}",
-            control_hz=15.0,
-            objects=SMALL,
-            workers=workers,
-            cache_dir=tmp_path / f"cache{workers}",
-            progress=False,
+            SourceOptions(path="pick_box_right,pick_cylinder_left"),
+            MotionSettings(
+                control_hz=15.0, objects=SMALL, cache_dir=tmp_path / f"cache{workers}"
+            ),
         )
-        made.append(library)
+        out = tmp_path / f"library{workers}"
+        made.append(run_order(order, out, workers=workers, progress=False))
     one, two = made
     assert one.names == two.names
     assert (one.frames == two.frames).all()
@@ -167,15 +165,11 @@ def test_two_workers_write_the_library_of_one(tmp_path):
 def test_slow_playback_halves_the_speed(tmp_path):
     lengths, speeds = [], []
     for speed in (1.0, 0.5):
-        library = prepare(
-            "procedural",
-            "pick_box_right",
-            out=tmp_path / f"{speed}",
-            control_hz=15.0,
-            objects=SMALL,
-            cache_dir=tmp_path / "cache",
-            speed=speed,
+        settings = MotionSettings(
+            control_hz=15.0, objects=SMALL, cache_dir=tmp_path / "cache", speed=speed
         )
+        order = Order("procedural", SourceOptions(path="pick_box_right"), settings)
+        library = run_order(order, tmp_path / f"{speed}")
         lengths.append(int(library.motions["length"][0]))
         speeds.append(library.frames["object_linvel"].norm(dim=-1).mean())
     assert lengths[1] == pytest.approx(2 * lengths[0], abs=2)
@@ -264,12 +258,12 @@ def test_objects_without_a_slot_are_chosen_by_touch_and_told():
         replace(box, name="shaken", pose=shaken),
     ]
     demo = replace(demo, objects=[*others, box], hand_object={})
-    aligned = align(demo, control_hz=15.0)
+    aligned = find_roles(align(demo, control_hz=15.0))
     assert aligned.object_names == ["shaken", "box"]
     assert aligned.hand_object.tolist() == [-1, 1]
     assert list(aligned.left_out) == ["still"]
     moving = replace(demo, objects=[others[1], replace(others[1], name="b"), box])
-    aligned = align(moving, control_hz=15.0)
+    aligned = find_roles(align(moving, control_hz=15.0))
     assert aligned.object_names[-1] == "box"
-    codes = [f.code for f in _check_left_out(aligned)]
+    codes = [f.code for f in check_left_out(aligned)]
     assert codes == ["W_OBJECTS"]

@@ -8,14 +8,24 @@ import trimesh
 from flashdex.datasets.demo import DemoObject
 from flashdex.datasets.keypoints import read_keypoints
 from flashdex.datasets.procedural.reader import procedural
+from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError, LibraryError, UnknownSourceError
-from flashdex.motions.checks.recording import check_demo, status_of
+from flashdex.motions.align import align
+from flashdex.motions.checks.recording import check_demo
+from flashdex.motions.contact.roles import find_roles
+from flashdex.motions.findings import status_of
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.pipeline.motion import MotionSettings, prepare_motion
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.objects.asset import ObjectSettings
 
 QUICK = ObjectSettings(sdf_resolution=40)
+
+
+def prepare(source, path=None, *, out, workers=1, **settings):
+    options = SourceOptions(path=path)
+    order = Order(source, options, MotionSettings(**settings))
+    return run_order(order, out, workers=workers)
 
 
 @pytest.fixture(scope="module")
@@ -275,9 +285,7 @@ def test_workers_give_the_same_library(tmp_path, cache, library):
 
 def test_recorded_tip_distances_are_met(demos):
     file = demos / "myodm" / "cubesmall_lift.npz"
-    from flashdex.motions.align import align
-
-    aligned = align(read_keypoints(file)[0], control_hz=50.0)
+    aligned = find_roles(align(read_keypoints(file)[0], control_hz=50.0))
     stored = np.load(file)["tipdist_right"]
     np.testing.assert_allclose(aligned.tip_dist[:, 1], stored, atol=2e-4)
     assert aligned.support_z == pytest.approx(0.0, abs=0.002)

@@ -8,12 +8,8 @@ from scipy.spatial.transform import Rotation
 from flashdex.datasets.body_models.human_hand import GRASP, hand_keypoints
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.tracks import palm_frame
-from flashdex.motions.checks.recording import (
-    check_demo,
-    concerning,
-    make_strict,
-    status_of,
-)
+from flashdex.motions.checks.recording import check_demo
+from flashdex.motions.findings import concerning, make_strict, status_of
 from flashdex.motions.repair.repair import repair
 
 FPS = 30.0

@@ -6,18 +6,19 @@ import torch
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.hands.attach import add_hand
 from flashdex.hands.collision_spheres import make_spheres
-from flashdex.hands.jacobian import HandJacobian
-from flashdex.hands.kinematics import HandKinematics
+from flashdex.hands.kinematics import HandJacobian, HandKinematics
 from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.align import align
+from flashdex.motions.contact.roles import find_roles
 from flashdex.motions.retarget.penetration import (
     make_reference_scene,
     measure_penetration,
 )
 from flashdex.motions.retarget.solver import Retargeter
 from flashdex.motions.retarget.targets import make_targets
-from flashdex.objects.asset import ObjectSettings, make_object, make_slot_grid
+from flashdex.objects.asset import ObjectSettings, make_object
+from flashdex.objects.solid import make_slot_grid
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +99,8 @@ def _depth(model, data, body, point):
 
 @pytest.fixture(scope="module")
 def solved(specs, tmp_path_factory):
-    aligned = align(procedural(0, kinds=["pick_box_right"])[0], control_hz=20.0)
+    demo = procedural(0, kinds=["pick_box_right"])[0]
+    aligned = find_roles(align(demo, control_hz=20.0))
     settings = ObjectSettings(sdf_resolution=48)
     cache = tmp_path_factory.mktemp("cache")
     asset = make_object(aligned.meshes[0], settings=settings, cache_dir=cache)

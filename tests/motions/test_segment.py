@@ -3,9 +3,10 @@ import pytest
 import trimesh
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.motions.checks.recording import check_demo, concerning, status_of
+from flashdex.motions.checks.recording import check_demo
 from flashdex.motions.contact.activity import nearest_tips, touches
 from flashdex.motions.contact.fingertips import tip_distances
+from flashdex.motions.findings import concerning, status_of
 from flashdex.motions.repair.repair import repair
 from flashdex.motions.repair.segment import segment
 

@@ -5,11 +5,11 @@ import trimesh
 from flashdex.datasets.support import estimate_support, still_runs
 from flashdex.motions.contact.fingertips import (
     CONTACT_DISTANCE,
-    assign_object,
     blend,
     contact_runs,
     tip_distances,
 )
+from flashdex.motions.contact.roles import choose_object
 from flashdex.motions.contact.support import support_disks
 
 FPS = 60.0
@@ -104,5 +104,5 @@ def test_hand_takes_the_object_it_touches_longest():
     brief, long = np.full((50, 5), 0.1), np.full((50, 5), 0.1)
     brief[:5] = 0.0
     long[10:40] = 0.01
-    assert assign_object([brief, long]) == 1
-    assert assign_object([np.full((50, 5), 0.3), np.full((50, 5), 0.2)]) == 1
+    assert choose_object([brief, long]) == 1
+    assert choose_object([np.full((50, 5), 0.3), np.full((50, 5), 0.2)]) == 1

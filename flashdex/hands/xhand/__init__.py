@@ -34,20 +34,9 @@ LINK_KEYPOINTS: dict[str, int] = {
 }
 
 # thumb to pinky; joint_error compares these two levels with LINK_KEYPOINTS
-LEVEL1_LINKS: tuple[str, ...] = (
-    "hand_thumb_rota_link1",
-    "hand_index_rota_link1",
-    "hand_mid_link1",
-    "hand_ring_link1",
-    "hand_pinky_link1",
-)
-DISTAL_LINKS: tuple[str, ...] = (
-    "hand_thumb_rota_link2",
-    "hand_index_rota_link2",
-    "hand_mid_link2",
-    "hand_ring_link2",
-    "hand_pinky_link2",
-)
+_FINGERS = ("thumb_rota", "index_rota", "mid", "ring", "pinky")
+LEVEL1_LINKS: tuple[str, ...] = tuple(f"hand_{f}_link1" for f in _FINGERS)
+DISTAL_LINKS: tuple[str, ...] = tuple(f"hand_{f}_link2" for f in _FINGERS)
 
 # Rotation of the base link in the geometric palm frame (x to the middle MCP, z out of
 # the palm): R_world_base = R_world_palm R_palm_base. wxyz.

@@ -1,4 +1,4 @@
-"""Who touches what and when, over a whole session, and what moves."""
+"""When hands touch objects, over a whole session, and what moves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from flashdex.datasets.tracks import (
     rotation,
     runs,
 )
-from flashdex.keys import SIDES, TIP_KEYPOINTS, Side
+from flashdex.keys import SIDES, Side
+from flashdex.motions.contact.fingertips import local_tips
 from flashdex.objects.meshes import reduce_mesh
 from flashdex.objects.signed_distance import surface_distance
 
@@ -31,64 +32,43 @@ SAMPLE_STEP = 0.005  # m
 
 @dataclass(frozen=True)
 class Activity:
-    """A session frame by frame.
+    """A session frame by frame."""
 
-    Args:
-        sides: hands, in the order of the axis H.
-        touch: hand touches object, (H, O, T) bool.
-        held: object that a hand is busy with, -1 for none, (H, T).
-        moving: object moves and gets somewhere, (O, T) bool.
-        pace: speed of each object, m/s, 0 where unknown, (O, T).
-        hand_seen: (H, T) bool.
-        object_seen: (O, T) bool.
-    """
-
-    sides: list[Side]
-    touch: np.ndarray
-    held: np.ndarray
-    moving: np.ndarray
-    pace: np.ndarray
-    hand_seen: np.ndarray
-    object_seen: np.ndarray
+    sides: list[Side]  # hands, in the order of the axis H
+    touch: np.ndarray  # hand touches object, (H, O, T) bool
+    held: np.ndarray  # object that a hand is busy with, -1 for none, (H, T)
+    moving: np.ndarray  # object moves and gets somewhere, (O, T) bool
+    pace: np.ndarray  # speed of each object, m/s, 0 where unknown, (O, T)
+    hand_seen: np.ndarray  # (H, T) bool
+    object_seen: np.ndarray  # (O, T) bool
 
 
 def find_activity(demo: HumanDemo, meshes: list[trimesh.Trimesh]) -> Activity:
-    """Contact and motion of a session; nothing is touched where a track is missing.
-
-    Args:
-        demo: with NaN where a hand or an object was not tracked.
-        meshes: of its objects, m.
-    """
+    """Contact and motion of a session; nothing is touched where a track is NaN."""
     sides: list[Side] = [s for s in SIDES if s in demo.keypoints]
     points = [demo.keypoints[s] for s in sides]
-    near = np.stack(
-        [
-            nearest_tips(points, body.pose, mesh)
-            for body, mesh in zip(demo.objects, meshes, strict=True)
-        ],
-        axis=1,
-    )
+    poses = [body.pose for body in demo.objects]
+    pairs = zip(poses, meshes, strict=True)
+    near = np.stack([nearest_tips(points, p, mesh) for p, mesh in pairs], axis=1)
     touch = np.stack([[touches(row) for row in hand] for hand in near])
-    held = np.stack(
-        [busy_with(n, t, demo.fps) for n, t in zip(near, touch, strict=True)]
-    )
-    speeds = [speeds_of(b.pose, demo.fps) for b in demo.objects]
-    moving = [moves(b.pose, s) for b, s in zip(demo.objects, speeds, strict=True)]
+    held = [busy_with(n, t, demo.fps) for n, t in zip(near, touch, strict=True)]
+    speeds = [_speeds(pose, demo.fps) for pose in poses]
+    moving = [_moves(p, s) for p, s in zip(poses, speeds, strict=True)]
     return Activity(
         sides=sides,
         touch=touch,
-        held=held,
+        held=np.stack(held),
         moving=np.stack(moving),
         pace=np.stack([np.nan_to_num(s[:, 0]) for s in speeds]),
         hand_seen=np.stack([~missing_frames(p) for p in points]),
-        object_seen=np.stack([~missing_frames(b.pose) for b in demo.objects]),
+        object_seen=np.stack([~missing_frames(p) for p in poses]),
     )
 
 
 def nearest_tips(
     hands: list[np.ndarray], pose: np.ndarray, mesh: trimesh.Trimesh
 ) -> np.ndarray:
-    """Distance of each hand's nearest fingertip to an object.
+    """Distance of each hand's nearest fingertip to an object, m, (H, T).
 
     Only tips within 3 cm of the bounding box are measured; the rest is infinitely far.
 
@@ -96,36 +76,25 @@ def nearest_tips(
         hands: keypoints of each, m, (T, 21, 3), NaN where not tracked.
         pose: of the object, (T, 7), NaN where not tracked.
         mesh: of the object, m.
-
-    Returns:
-        m, (H, T).
     """
     near = np.full((len(hands), len(pose)), np.inf)
-    tips = np.stack([k[:, TIP_KEYPOINTS] for k in hands])
     seen = ~missing_frames(pose)
     if not seen.any():
         return near
-    local = np.full_like(tips, np.nan)
-    turn = rotation(pose[seen, 3:]).as_matrix()
-    offset = tips[:, seen] - pose[None, seen, None, :3]
-    local[:, seen] = np.einsum("tji,htkj->htki", turn, offset)
+    local = np.full((*near.shape, 5, 3), np.nan)
+    local[:, seen] = [local_tips(keypoints[seen], pose[seen]) for keypoints in hands]
     low, high = mesh.bounds
     outside = np.linalg.norm(np.maximum(low - local, local - high).clip(0), axis=-1)
     hand, frame, finger = np.nonzero(outside < LEAVE)  # NaN compares as False
     if len(hand):
-        points = local[hand, frame, finger]
         coarse = reduce_mesh(mesh, max_faces=MESH_FACES)
-        gaps = surface_distance(coarse, points, step=SAMPLE_STEP)
+        gaps = surface_distance(coarse, local[hand, frame, finger], step=SAMPLE_STEP)
         np.minimum.at(near, (hand, frame), gaps)
     return near
 
 
 def touches(near: np.ndarray) -> np.ndarray:
-    """Touch with hysteresis, (T,) bool: begins below 2 cm, ends above 3 cm.
-
-    Args:
-        near: distance, m, (T,).
-    """
+    """Touch of distances (m, (T,)) with hysteresis: below 2 cm, then up to 3 cm."""
     mask = np.zeros(len(near), dtype=bool)
     for start, end in runs(near < LEAVE):
         mask[start:end] = near[start:end].min() < TOUCH
@@ -152,8 +121,7 @@ def busy_with(near: np.ndarray, touch: np.ndarray, fps: float) -> np.ndarray:
     busy = bridge(np.asarray(touch.any(axis=0)), fps)
     held = np.where(busy, mean.argmin(axis=0), -1)
     edges = np.flatnonzero(np.diff(held)) + 1
-    spans = np.split(np.arange(len(held)), edges)
-    for span in spans:
+    for span in np.split(np.arange(len(held)), edges):
         if held[span[0]] >= 0 and len(span) < TOUCH_SECONDS * fps:
             before = held[span[0] - 1] if span[0] else -1
             after = held[span[-1] + 1] if span[-1] + 1 < len(held) else -1
@@ -170,7 +138,7 @@ def bridge(mask: np.ndarray, fps: float) -> np.ndarray:
     return mask
 
 
-def speeds_of(pose: np.ndarray, fps: float) -> np.ndarray:
+def _speeds(pose: np.ndarray, fps: float) -> np.ndarray:
     """Linear (m/s) and angular speed (rad/s), NaN where not tracked, (T, 2)."""
     speeds = np.full((len(pose), 2), np.nan)
     for a, b in runs(~missing_frames(pose), least=3):
@@ -181,17 +149,11 @@ def speeds_of(pose: np.ndarray, fps: float) -> np.ndarray:
     return speeds
 
 
-def moves(pose: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """Frames of motions that get somewhere (2 cm or 15 degrees); jitter does not.
-
-    Args:
-        pose: (T, 7), NaN where not tracked.
-        speeds: of ``speeds_of``, (T, 2).
-    """
+def _moves(pose: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Frames of motions that get somewhere, (T,) bool; jitter does not."""
     mask = np.zeros(len(pose), dtype=bool)
     for a, b in runs((speeds[:, 0] > STILL_SPEED) | (speeds[:, 1] > STILL_TURN)):
-        travel, turn = motion_of(pose[a:b])
-        mask[a:b] = travel > MOVE_TRAVEL or turn > MOVE_TURN
+        mask[a:b] = has_moved(pose[a:b])
     return mask
 
 
@@ -203,3 +165,9 @@ def motion_of(pose: np.ndarray) -> tuple[float, float]:
     turn = rotation(pose[:, 3:])
     travel = np.linalg.norm(pose[:, :3] - pose[0, :3], axis=-1).max()
     return float(travel), float((turn * turn[0].inv()).magnitude().max())
+
+
+def has_moved(pose: np.ndarray) -> bool:
+    """Whether a track (T, 7) gets 2 cm or 15 degrees away from where it began."""
+    travel, turn = motion_of(pose)
+    return travel > MOVE_TRAVEL or turn > MOVE_TURN

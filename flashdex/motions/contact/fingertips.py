@@ -1,4 +1,4 @@
-"""Human contact: fingertip distances, which hand uses which object, and when."""
+"""Fingertips at objects: their distances, and when they touch."""
 
 from __future__ import annotations
 
@@ -11,41 +11,35 @@ from flashdex.keys import TIP_KEYPOINTS
 from flashdex.objects.signed_distance import surface_distance
 
 CONTACT_DISTANCE = 0.015  # m
-NO_OBJECT = 10.0  # m, tip distance of a hand without object
 CLOSE_SECONDS = 0.15
 LEAST_SECONDS = 0.10
 BLEND_FRAMES = 6
 SAMPLE_STEP = 0.003  # m, between the samples that find candidate triangles
 
 
+def local_tips(keypoints: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Human fingertips in an object's frame, m, (T, 5, 3).
+
+    Args:
+        keypoints: m, world, (T, 21, 3).
+        pose: of the object, (T, 7).
+    """
+    tips = keypoints[:, TIP_KEYPOINTS] - pose[:, None, :3]
+    return np.einsum("tji,tkj->tki", rotation(pose[:, 3:]).as_matrix(), tips)
+
+
 def tip_distances(
     keypoints: np.ndarray, pose: np.ndarray, mesh: trimesh.Trimesh
 ) -> np.ndarray:
-    """Unsigned distance of the human fingertips to an object's surface.
+    """Unsigned distance of the human fingertips to an object's surface, m, (T, 5).
 
     Args:
         keypoints: m, world, (T, 21, 3).
         pose: of the object, (T, 7).
         mesh: of the object, m.
-
-    Returns:
-        m, (T, 5).
     """
-    tips = keypoints[:, TIP_KEYPOINTS] - pose[:, None, :3]
-    local = np.einsum("tji,tkj->tki", rotation(pose[:, 3:]).as_matrix(), tips)
-    gaps = surface_distance(mesh, local.reshape(-1, 3), step=SAMPLE_STEP)
-    return gaps.reshape(local.shape[:2])
-
-
-def assign_object(distances: list[np.ndarray]) -> int:
-    """Slot of the object that a hand touches longest; the nearest one breaks ties.
-
-    Args:
-        distances: per object (T, 5), m.
-    """
-    nearest = [d.min(axis=1) for d in distances]
-    scores = [(int((n < CONTACT_DISTANCE).sum()), -float(n.min())) for n in nearest]
-    return max(range(len(scores)), key=scores.__getitem__)
+    tips = local_tips(keypoints, pose).reshape(-1, 3)
+    return surface_distance(mesh, tips, step=SAMPLE_STEP).reshape(-1, 5)
 
 
 def contact_runs(distances: np.ndarray, fps: float) -> np.ndarray:
@@ -62,5 +56,5 @@ def contact_runs(distances: np.ndarray, fps: float) -> np.ndarray:
 
 
 def blend(mask: np.ndarray) -> np.ndarray:
-    """Weights in 0..1 that ramp over six frames around contact runs, (T, 5)."""
+    """Weights in 0..1 that ramp over six frames around contact runs, (T, ...)."""
     return uniform_filter1d(mask.astype(float), BLEND_FRAMES, axis=0, mode="nearest")

@@ -43,11 +43,7 @@ def content_hash(recording: Recording) -> str:
 
 
 def cache_file(recording: Recording, settings: MotionSettings) -> Path:
-    """Where the result of a recording is kept.
-
-    Args:
-        recording: listed.
-        settings: that it is prepared with; they name the cache too.
+    """Where the result of a recording with these settings is kept.
 
     Raises:
         OSError: a file of the recording cannot be read.
@@ -73,30 +69,20 @@ def _code_hash() -> str:
 
 
 def write_prepared(file: Path, prepared: list[Prepared]) -> None:
-    """Keep the outcome of a recording; a failure is logged and not fatal.
-
-    Args:
-        file: from ``cache_file``.
-        prepared: all motions of the recording, rejected ones too.
-    """
+    """Keep all motions of a recording, rejected ones too; a failure is only logged."""
     arrays: dict[str, np.ndarray] = {}
-    entries = []
+    entries: list[dict[str, Any]] = []
     for i, item in enumerate(prepared):
         entries.append({"row": item.row, "record": None})
         if item.record is None:
             continue
-        record = item.record
+        fields = dict(vars(item.record))
         for kind in ("frames", "quality"):
-            for key, value in getattr(record, kind).items():
-                arrays[f"{i}/{kind}/{key}"] = value
-        arrays[f"{i}/support_disks"] = record.support_disks
-        entries[-1]["record"] = {
-            "name": record.name,
-            "hand_active": record.hand_active,
-            "hand_object": record.hand_object,
-            "objects": [[a.name, a.sha256] for a in record.objects],
-            "info": record.info,
-        }
+            table = fields.pop(kind)
+            arrays |= {f"{i}/{kind}/{key}": value for key, value in table.items()}
+        arrays[f"{i}/support_disks"] = fields.pop("support_disks")
+        fields["objects"] = [[a.name, a.sha256] for a in fields["objects"]]
+        entries[-1]["record"] = fields
     try:
         arrays["entries"] = np.array(json.dumps(entries, default=str))
         with open_atomic(file) as stream:
@@ -108,47 +94,39 @@ def write_prepared(file: Path, prepared: list[Prepared]) -> None:
 def read_prepared(file: Path, root: Path) -> list[Prepared] | None:
     """What ``write_prepared`` kept; None when it, or an object of it, is not there.
 
-    Args:
-        file: from ``cache_file``.
-        root: of the cache, where the objects are.
+    The objects are in the cache ``root``.
     """
     if not file.is_file():
         return None
     try:
         with np.load(file, allow_pickle=False) as stored:
             entries = json.loads(str(stored["entries"]))
-            items = [_read_item(stored, i, e, root) for i, e in enumerate(entries)]
+            records = [_read_record(stored, i, e, root) for i, e in enumerate(entries)]
+            pairs = zip(records, entries, strict=True)
+            return [Prepared(record, entry["row"]) for record, entry in pairs]
     except DAMAGED as error:
         logger.warning("%s: unreadable (%s); preparing the motion again", file, error)
         return None
-    return items
 
 
-def _read_item(stored: Any, i: int, entry: dict[str, Any], root: Path) -> Prepared:
+def _read_record(
+    stored: Any, row: int, entry: dict[str, Any], root: Path
+) -> MotionRecord | None:
     fields = entry["record"]
     if fields is None:
-        return Prepared(None, entry["row"])
+        return None
     objects = []
     for name, sha256 in fields["objects"]:
         asset = read_object(sha256, name=name, cache_dir=root)
         if asset is None:
             raise KeyError(f"object {name}")
         objects.append(asset)
-    parts: dict[str, dict[str, np.ndarray]] = {"frames": {}, "quality": {}}
+    fields["objects"] = objects
+    fields["frames"], fields["quality"] = {}, {}
     for key in stored.files:
         words = key.split("/")
-        if words[0] == str(i) and len(words) == 3:
-            parts[words[1]][words[2]] = stored[key]
-    left_active, right_active = fields["hand_active"]
-    left_slot, right_slot = fields["hand_object"]
-    record = MotionRecord(
-        name=fields["name"],
-        frames=parts["frames"],
-        quality=parts["quality"],
-        hand_active=(left_active, right_active),
-        hand_object=(left_slot, right_slot),
-        objects=objects,
-        support_disks=stored[f"{i}/support_disks"],
-        info=fields["info"],
-    )
-    return Prepared(record, entry["row"])
+        if words[0] == str(row) and len(words) == 3:
+            fields[words[1]][words[2]] = stored[key]
+    for pair in ("hand_active", "hand_object"):
+        fields[pair] = tuple(fields[pair])
+    return MotionRecord(**fields, support_disks=stored[f"{row}/support_disks"])

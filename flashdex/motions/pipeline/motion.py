@@ -1,91 +1,69 @@
-"""From one demonstration to one library motion: align, reference, check."""
+"""From a recording to library motions, stage by stage; nothing raises.
+
+    recording -> repair -> (segment) -> align -> roles -> retarget -> checks -> record
+
+Each stage is a function that takes what the former one returned. Whatever is wrong with
+a recording, one of its motions or a piece of one becomes a rejected row of the report
+and costs nothing else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from functools import partial
+import logging
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
-from flashdex.datasets.demo import HumanDemo
-from flashdex.datasets.tracks import angular_velocity, linear_velocity
+from flashdex.datasets.demo import MAX_SECONDS, HumanDemo
+from flashdex.datasets.source import Recording
 from flashdex.errors import DemoError, MeshError
-from flashdex.hands.collision_spheres import HandModel
-from flashdex.hands.spec import HandSpec, load_hand
-from flashdex.keys import SIDES, Side
-from flashdex.motions.align import AlignedDemo, align
-from flashdex.motions.checks.aligned import check_aligned, check_retarget
-from flashdex.motions.checks.recording import (
+from flashdex.hands.spec import load_hand
+from flashdex.keys import SIDES
+from flashdex.motions.align import align
+from flashdex.motions.checks.aligned import check_aligned, check_reference
+from flashdex.motions.checks.recording import check_demo, check_sides
+from flashdex.motions.contact.roles import find_roles
+from flashdex.motions.findings import (
     Finding,
-    check_company,
-    check_demo,
-    check_sides,
+    concerning,
     make_strict,
+    of_error,
+    of_reader,
+    reason_of,
     status_of,
 )
-from flashdex.motions.contact.fingertips import NO_OBJECT
-from flashdex.motions.contact.support import support_disks
-from flashdex.motions.library import NUM_OBJECT_SLOTS
+from flashdex.motions.frames import make_record
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.retarget.penetration import (
-    make_reference_scene,
-    measure_penetration,
-)
-from flashdex.motions.retarget.residuals import RetargetWeights, Targets
-from flashdex.motions.retarget.solver import Retargeter
-from flashdex.motions.retarget.starts import Choice, choose_attempt
-from flashdex.motions.retarget.targets import _park, make_targets
-from flashdex.objects.asset import (
-    ObjectAsset,
-    ObjectSettings,
-    default_cache_dir,
-    make_object,
-    make_slot_grid,
-)
-from flashdex.objects.meshes import hull_vertices
+from flashdex.motions.repair.repair import repair
+from flashdex.motions.repair.segment import segment
+from flashdex.motions.retarget.residuals import RetargetWeights
+from flashdex.motions.retarget.starts import retarget
+from flashdex.objects.asset import ObjectSettings, default_cache_dir, make_object
+from flashdex.objects.solid import make_slot_grid
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class MotionSettings:
     """How motions are prepared.
 
-    Args:
-        hand: robot hand.
-        control_hz: frames a second of the references.
-        objects: how meshes become objects.
-        weights: of the retargeting.
-        attempts: of the inverse kinematics at most; the best one is kept.
-        cut: cut recordings where contact begins and ends: ``auto`` cuts sessions and
-            what lasts too long, ``never`` takes every recording as it is.
-        speed: of playback; 0.5 makes every motion last twice as long.
-        strict: reject what would be flagged.
-        cache_dir: of prepared objects and motions; the user's cache by default.
+    Recordings are cut where contact begins and ends: with ``cut="auto"`` sessions and
+    what lasts too long, with ``"never"`` every recording is taken as it is.
     """
 
-    hand: str = "xhand"
-    control_hz: float = 60.0
+    hand: str = "xhand"  # robot hand
+    control_hz: float = 60.0  # frames a second of the references
     objects: ObjectSettings = field(default_factory=ObjectSettings)
     weights: RetargetWeights = field(default_factory=RetargetWeights)
-    attempts: int = 6
+    attempts: int = 6  # of the inverse kinematics at most; the best one is kept
     cut: Literal["auto", "always", "never"] = "auto"
-    speed: float = 1.0
-    strict: bool = False
-    cache_dir: Path | None = None
-
-    @property
-    def cache_root(self) -> Path:
-        """Folder of the cache."""
-        return self.cache_dir or default_cache_dir()
-
-    def facts(self) -> dict[str, Any]:
-        """All that decides the result: everything but the place of the cache."""
-        chosen = asdict(self)
-        chosen.pop("cache_dir")
-        return chosen
+    speed: float = 1.0  # of playback; 0.5 makes every motion last twice as long
+    strict: bool = False  # reject what would be flagged
+    cache_dir: Path | None = None  # of objects and motions; by default the user's
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense."""
@@ -94,6 +72,15 @@ class MotionSettings:
                 f"control rate {self.control_hz:g} and speed {self.speed:g} must be "
                 f"positive (--hz, --speed)."
             )
+
+    @property
+    def cache_root(self) -> Path:
+        """Folder of the cache."""
+        return self.cache_dir or default_cache_dir()
+
+    def facts(self) -> dict[str, Any]:
+        """All that decides the result: everything but the place of the cache."""
+        return {k: v for k, v in asdict(self).items() if k != "cache_dir"}
 
 
 @dataclass
@@ -104,27 +91,71 @@ class Prepared:
     row: dict[str, Any]
 
 
+def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
+    """All motions of a listed recording, rejected ones too."""
+
+    def read_all() -> list[Prepared]:
+        demos = recording.read()
+        return [item for demo in demos for item in prepare_demo(demo, settings)]
+
+    return _guard(recording.name, read_all)
+
+
+def prepare_demo(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
+    """Repair a demonstration, cut it if it is to be cut, prepare every piece."""
+    return _guard(demo.name, lambda: _prepare_pieces(demo, settings))
+
+
+def _prepare_pieces(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]:
+    if settings.speed != 1.0:
+        told = demo.provenance | {"speed": settings.speed}
+        demo = replace(demo, fps=demo.fps * settings.speed, provenance=told)
+    demo.validate(complete=False)
+    long = demo.needs_cutting or demo.seconds > MAX_SECONDS
+    is_cut = settings.cut == "always" or (settings.cut == "auto" and long)
+    pieces, findings = repair(demo, keep_gaps=is_cut)
+    findings += of_reader(demo)
+    if is_cut and pieces:
+        pieces, remarks = segment(pieces[0])
+        findings += remarks
+    if not pieces:
+        return [rejected(demo.name, findings)]
+
+    def prepare(piece: HumanDemo) -> list[Prepared]:
+        return [prepare_motion(piece, settings, concerning(findings, piece))]
+
+    return [i for p in pieces for i in _guard(p.name, lambda p=p: prepare(p))]
+
+
+def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
+    """What one step makes; what goes wrong in it costs nothing but this step."""
+    try:
+        return make()
+    except Exception as error:  # what no check foresaw must not end the others
+        logger.debug("%s", name, exc_info=True)
+        return [rejected(name, [of_error(error)])]
+
+
+def rejected(name: str, findings: list[Finding]) -> Prepared:
+    """A motion, or a whole recording, that is not prepared at all."""
+    row = {"motion": name, "status": "rejected", "reason": reason_of(findings)}
+    return Prepared(None, row)
+
+
 def prepare_motion(
     demo: HumanDemo, settings: MotionSettings, findings: list[Finding] | None = None
 ) -> Prepared:
     """Prepare one motion; a fault of the recording becomes a rejected row.
 
-    Args:
-        demo: the recording.
-        settings: how.
-        findings: remarks from earlier steps.
+    The findings are remarks from earlier steps.
     """
     row: dict[str, Any] = {"motion": demo.name}
     findings = list(findings or [])
     record = None
     try:
-        demo.validate()
-        findings += check_demo(demo) + check_sides(demo)
-        if status_of(findings) != "rejected":
-            record = _prepare(demo, settings, findings, row)
+        record = _prepare(demo, settings, findings, row)
     except (DemoError, MeshError) as error:
-        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        findings.append(Finding(code, "reject", str(error)))
+        findings.append(of_error(error))
     if settings.strict:
         findings = make_strict(findings)
     row["source"], row["split"], row["task"] = demo.source, demo.split, demo.task
@@ -136,137 +167,30 @@ def prepare_motion(
     return Prepared(record, row)
 
 
-def reject(name: str, findings: list[Finding]) -> Prepared:
-    """A motion, or a whole recording, that is not prepared at all."""
-    row = {"motion": name, "status": "rejected", "reason": reason_of(findings)}
-    return Prepared(None, row)
-
-
-def reason_of(findings: list[Finding]) -> str:
-    """Findings as the report shows them."""
-    return "; ".join(f"{f.code}: {f.text}" for f in findings)
-
-
 def _prepare(
     demo: HumanDemo, settings: MotionSettings, findings: list[Finding], row: dict
 ) -> MotionRecord | None:
-    aligned = align(demo, control_hz=settings.control_hz)
+    """The stages of one motion; they add to the findings and to its row."""
+    demo.validate()
+    findings += check_demo(demo) + check_sides(demo)
+    if status_of(findings) == "rejected":
+        return None
+    motion = find_roles(align(demo, control_hz=settings.control_hz))
     assets = [
         make_object(m, settings=settings.objects, cache_dir=settings.cache_dir, name=n)
-        for m, n in zip(aligned.meshes, aligned.object_names, strict=True)
+        for m, n in zip(motion.meshes, motion.object_names, strict=True)
     ]
-    early, figures = check_aligned(
-        aligned, assets, make_slot_grid(assets, solid=False), up=demo.up
-    )
-    findings += early + check_company(aligned)
+    found, figures = check_aligned(motion, assets, make_slot_grid(assets, solid=False))
+    findings += found
     row |= figures
     if status_of(findings) == "rejected":
         return None
     specs = load_hand(settings.hand)
-    choice, targets = _retarget(aligned, assets, specs, settings)
-    best = choice.best
-    ranges = np.stack([specs["left"].joint_range, specs["right"].joint_range])
-    late, figures = check_retarget(
-        aligned, best.joint_pos, best.tip_error, best.depth, ranges
+    choice, targets = retarget(
+        motion, assets, specs, weights=settings.weights, attempts=settings.attempts
     )
-    findings += late
+    ranges = np.stack([specs[side].joint_range for side in SIDES])
+    found, figures = check_reference(motion, choice.best, ranges)
+    findings += found
     row |= figures
-    return _record(demo, aligned, assets, choice, targets)
-
-
-def _retarget(
-    aligned: AlignedDemo,
-    assets: list[ObjectAsset],
-    specs: Mapping[Side, HandSpec],
-    settings: MotionSettings,
-) -> tuple[Choice, Targets]:
-    targets = make_targets(aligned, HandModel(specs))
-    scene = make_reference_scene(specs, [a.parts for a in assets])
-    acting = np.flatnonzero(aligned.active)
-    used: dict[Side, HandSpec] = {SIDES[h]: specs[SIDES[h]] for h in acting}
-    choice = choose_attempt(
-        Retargeter(used, weights=settings.weights),
-        targets.of(torch.tensor(acting)),
-        make_slot_grid(assets, solid=True),
-        count=settings.attempts,
-        park=partial(_park, acting=acting),
-        measure=partial(
-            measure_penetration, scene, poses=aligned.poses, active=aligned.active
-        ),
-    )
-    return choice, targets
-
-
-def _record(
-    demo: HumanDemo,
-    aligned: AlignedDemo,
-    assets: list[ObjectAsset],
-    choice: Choice,
-    targets: Targets,
-) -> MotionRecord:
-    vertices = [hull_vertices(m) for m in aligned.meshes]
-    left, right = map(bool, aligned.active)
-    left_slot, right_slot = map(int, aligned.hand_object)
-    best = choice.best
-    return MotionRecord(
-        name=demo.name,
-        frames=make_frames(aligned, best.joint_pos, targets),
-        hand_active=(left, right),
-        hand_object=(left_slot, right_slot),
-        objects=assets,
-        support_disks=support_disks(aligned.poses, vertices, aligned.fps),
-        info={
-            "source": demo.source,
-            "licence": demo.licence,
-            "split": demo.split,
-            "task": demo.task,
-            "source_fps": demo.fps / demo.provenance.get("speed", 1.0),
-            "objects": aligned.object_names,
-            "support_z": aligned.support_z,
-            "attempt_scores_m": choice.scores,
-            "provenance": demo.provenance,
-        },
-        quality={
-            "tip_error": _both(best.tip_error, aligned.active),
-            "penetration": best.depth.objects.astype(np.float32),
-            "contact": aligned.contact,
-        },
-    )
-
-
-def _both(values: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Values of the hands that take part, zero for the others, (T, 2, ...)."""
-    out = np.zeros((len(values), 2, *values.shape[2:]), dtype=np.float32)
-    out[:, active] = values
-    return out
-
-
-def make_frames(
-    aligned: AlignedDemo, joint_pos: np.ndarray, targets: Targets
-) -> dict[str, np.ndarray]:
-    """All per-frame entries of the library, float32."""
-    fps, frames = aligned.fps, aligned.num_frames
-    poses = np.zeros((frames, NUM_OBJECT_SLOTS, 7))
-    poses[..., 3] = 1.0
-    for slot, pose in enumerate(aligned.poses):
-        poses[:, slot] = pose
-    wrist_quat = targets.wrist_quat.numpy()
-    turns = [angular_velocity(wrist_quat[:, h], fps) for h in range(2)]
-    spins = [angular_velocity(poses[:, s, 3:], fps) for s in range(NUM_OBJECT_SLOTS)]
-    tip_dist = np.where(aligned.active[:, None], aligned.tip_dist, NO_OBJECT)
-    entries = {
-        "joint_pos": joint_pos,
-        "joint_vel": linear_velocity(joint_pos, fps),
-        "wrist_pos": aligned.keypoints[:, :, 0],
-        "wrist_quat": wrist_quat,
-        "wrist_linvel": linear_velocity(aligned.keypoints[:, :, 0], fps),
-        "wrist_angvel": np.stack(turns, axis=1),
-        "keypoints": aligned.keypoints,
-        "keypoint_linvel": linear_velocity(aligned.keypoints, fps),
-        "tip_dist": tip_dist,
-        "object_pos": poses[..., :3],
-        "object_quat": poses[..., 3:],
-        "object_linvel": linear_velocity(poses[..., :3], fps),
-        "object_angvel": np.stack(spins, axis=1),
-    }
-    return {k: v.astype(np.float32) for k, v in entries.items()}
+    return make_record(demo, motion, assets, choice, targets)

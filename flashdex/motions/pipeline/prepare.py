@@ -11,22 +11,20 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flashdex.datasets import list_recordings
 from flashdex.datasets.source import Recording, SourceOptions
 from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
+from flashdex.motions.findings import reject
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.motions.pipeline.cache import cache_file, content_hash
-from flashdex.motions.pipeline.jobs import Job, Outcome
-from flashdex.motions.pipeline.motion import MotionSettings
-from flashdex.motions.pipeline.workers import run_jobs
-from flashdex.motions.retarget.residuals import RetargetWeights
-from flashdex.objects.asset import ObjectSettings
+from flashdex.motions.pipeline.motion import MotionSettings, rejected
+from flashdex.motions.pipeline.workers import Job, Outcome, run_jobs
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 _LOG = logging.getLogger(__name__)
@@ -36,102 +34,15 @@ PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be prepared, and how.
+    """What is to be prepared, and how."""
 
-    Args:
-        source: name of a reader.
-        options: what it is told.
-        settings: of the preparation.
-    """
-
-    source: str
-    options: SourceOptions
-    settings: MotionSettings
+    source: str  # name of a reader, see ``flashdex.datasets.SOURCES``
+    options: SourceOptions = field(default_factory=SourceOptions)
+    settings: MotionSettings = field(default_factory=MotionSettings)
 
     def recordings(self) -> list[Recording]:
         """The recordings, listed but not read."""
         return list_recordings(self.source, self.options)
-
-
-def prepare(
-    source: str,
-    input: str | Path | None = None,
-    hand: str = "xhand",
-    out: str | Path = "library",
-    *,
-    control_hz: float = 60.0,
-    workers: int = 1,
-    ray: bool = False,
-    limit: int | None = None,
-    seed: int = 0,
-    mano: Path | None = None,
-    models: Path | None = None,
-    splits: Path | None = None,
-    cut: Literal["auto", "always", "never"] = "auto",
-    speed: float = 1.0,
-    strict: bool = False,
-    objects: ObjectSettings | None = None,
-    weights: RetargetWeights | None = None,
-    cache_dir: Path | None = None,
-    progress: bool | None = None,
-) -> MotionLibrary:
-    """Prepare a collection of recordings as a motion library.
-
-    What was prepared before, with the same content, settings and code, comes from the
-    cache: an interrupted preparation goes on where it was.
-
-    Args:
-        source: name of a reader, see ``flashdex.datasets.SOURCES``.
-        input: what it reads, mostly the dataset's folder.
-        hand: robot hand.
-        out: directory of the library; an older library there is replaced at the end.
-        control_hz: frames a second of the references.
-        workers: processes.
-        ray: use a Ray cluster in place of processes.
-        limit: at most this many recordings.
-        seed: of made-up motions.
-        mano: folder with the MANO models, for sources that need them.
-        models: folder of the object models, where it lies apart from the dataset.
-        splits: file that names each recording's split, where it lies apart.
-        cut: see ``MotionSettings``.
-        speed: of playback; 0.5 makes every motion last twice as long.
-        strict: reject what would be flagged.
-        objects: how meshes become objects.
-        weights: of the retargeting.
-        cache_dir: of prepared objects and motions.
-        progress: show a bar; by default when standard error is a terminal.
-
-    Returns:
-        The library; ``report.csv`` in it has a row for every motion, rejected ones too.
-
-    Raises:
-        FlashdexError: unknown names, unreadable input, nothing kept, disk refused.
-
-    Example:
-        >>> library = prepare("procedural", out="/tmp/quickstart")  # doctest: +SKIP
-        >>> library.num_motions  # doctest: +SKIP
-        4
-    """
-    options = SourceOptions(
-        path=None if input is None else Path(input),
-        mano=mano,
-        models=models,
-        splits=splits,
-        seed=seed,
-        limit=limit,
-    )
-    settings = MotionSettings(
-        hand=hand,
-        control_hz=control_hz,
-        objects=objects or ObjectSettings(),
-        weights=weights or RetargetWeights(),
-        cut=cut,
-        speed=speed,
-        strict=strict,
-        cache_dir=cache_dir,
-    )
-    order = Order(source, options, settings)
-    return run_order(order, out, workers=workers, ray=ray, progress=progress)
 
 
 def run_order(
@@ -142,14 +53,28 @@ def run_order(
     ray: bool = False,
     progress: bool | None = None,
 ) -> MotionLibrary:
-    """Prepare what an order names; see :func:`prepare`.
+    """Prepare a collection of recordings as a motion library.
+
+    What was prepared before, with the same content, settings and code, comes from the
+    cache: an interrupted preparation goes on where it was.
 
     Args:
         order: recordings and settings.
-        out: directory of the library.
+        out: directory of the library; an older library there is replaced at the end.
         workers: processes.
         ray: use a Ray cluster in place of processes.
-        progress: show a bar.
+        progress: show a bar; by default when standard error is a terminal.
+
+    Returns:
+        The library; ``report.csv`` in it has a row for every motion, rejected ones too.
+
+    Raises:
+        FlashdexError: unknown names, unreadable input, nothing kept, disk refused.
+
+    Example:
+        >>> library = run_order(Order("procedural"), "/tmp/made")  # doctest: +SKIP
+        >>> library.num_motions  # doctest: +SKIP
+        4
     """
     settings = order.settings
     load_hand(settings.hand)  # refuses an unknown name before anything is read
@@ -159,9 +84,12 @@ def run_order(
     _tell_start(jobs, workers)
     outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.rows] + doubles
-    manifest = _facts(order, listed, rows)
-    hand, fps = settings.hand, settings.control_hz
-    writer = LibraryWriter(out, hand=hand, fps=fps, manifest=manifest)
+    writer = LibraryWriter(
+        out,
+        hand=settings.hand,
+        fps=settings.control_hz,
+        manifest=_facts(order, listed, rows),
+    )
     for record in _records(outcomes, settings.cache_root):
         writer.add(record)
     _refuse_empty(rows, out)
@@ -177,24 +105,16 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
         with suppress(OSError):
             known += cache_file(job.recording, job.settings).is_file()
     left = len(jobs) - known
-    text = f"{known} of {len(jobs)} recordings are in the cache {root}"
     more = f", {left} to do; a new mesh can take a minute" if left else ""
-    _LOG.info("%s%s", text, more)
+    text = "%d of %d recordings are in the cache %s%s"
+    _LOG.info(text, known, len(jobs), root, more)
 
 
-def hash_inputs(order: Order) -> str:
-    """SHA-256 of the recordings' content and the settings, not of the code.
-
-    Args:
-        order: recordings and settings.
-    """
-    return _hash_inputs(order.recordings(), order.settings)
-
-
-def _hash_inputs(recordings: list[Recording], settings: MotionSettings) -> str:
-    text = json.dumps(settings.facts(), sort_keys=True)
+def hash_inputs(order: Order, listed: list[Recording] | None = None) -> str:
+    """SHA-256 of the recordings' content and the settings, not of the code."""
+    text = json.dumps(order.settings.facts(), sort_keys=True)
     digest = hashlib.sha256(text.encode())
-    for recording in recordings:
+    for recording in order.recordings() if listed is None else listed:
         digest.update(recording.name.encode())
         with suppress(OSError):  # a file that cannot be read has no content
             digest.update(content_hash(recording).encode())
@@ -214,21 +134,19 @@ def _without_doubles(
             key = recording.name  # its worker says what cannot be read
         first = kept.setdefault(key, recording)
         if first is not recording:
-            text = f"I_DUP: the same content as '{first.name}'"
-            rows.append(
-                {"motion": recording.name, "status": "rejected", "reason": text}
-            )
+            double = reject("I_DUP", f"the same content as '{first.name}'")
+            rows.append(rejected(recording.name, [double]).row)
     return list(kept.values()), rows
 
 
 def _facts(
-    order: Order, recordings: list[Recording], rows: list[dict[str, Any]]
+    order: Order, listed: list[Recording], rows: list[dict[str, Any]]
 ) -> dict[str, Any]:
     return {
         "source": order.source,
         "seed": order.options.seed,
         "settings": order.settings.facts(),
-        "inputs": _hash_inputs(recordings, order.settings),
+        "inputs": hash_inputs(order, listed),
         "versions": {p: importlib.metadata.version(p) for p in PACKAGES},
         "quality": dict(Counter(row["status"] for row in rows)),
     }
@@ -259,14 +177,9 @@ def _refuse_empty(rows: list[dict[str, Any]], out: str | Path) -> None:
 
 
 def make_report(rows: list[dict[str, Any]]) -> str:
-    """CSV with a row a motion; the columns are motion, status, reason, figures.
-
-    Args:
-        rows: of all motions, kept or not.
-    """
-    figures = dict.fromkeys(key for row in rows for key in row)
-    columns = ["motion", "status", "reason"]
-    columns += [key for key in figures if key not in columns]
+    """CSV with a row a motion, kept or not: motion, status, reason, then figures."""
+    first = ("motion", "status", "reason")
+    columns = dict.fromkeys([*first, *(key for row in rows for key in row)])
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()

@@ -1,4 +1,8 @@
-"""Jobs over worker processes, or over a Ray cluster, with progress and no lost work."""
+"""Jobs, one a recording, over worker processes or over a Ray cluster.
+
+A job finds its recording in the cache or prepares it into it; no work is lost, and one
+bad recording costs only itself.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +15,91 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
 
-from flashdex.errors import MissingExtraError
-from flashdex.motions.pipeline.jobs import Job, Outcome, crashed, run_job
+from flashdex.datasets.source import Recording
+from flashdex.errors import LibraryError, MissingExtraError
+from flashdex.motions.findings import of_error, reject
+from flashdex.motions.pipeline.cache import cache_file, read_prepared, write_prepared
+from flashdex.motions.pipeline.motion import (
+    MotionSettings,
+    Prepared,
+    prepare_recording,
+    rejected,
+)
+from flashdex.objects.meshes import MESH_SUFFIXES
 
 _LOG = logging.getLogger(__name__)
 
-MESHES = (".obj", ".stl", ".ply", ".glb", ".off")
 LINE_SECONDS = 15.0  # between progress lines where there is no terminal
 # One worker is one core: threads of torch and CoACD would fight over the others.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker is given: a recording and how to prepare it."""
+
+    recording: Recording
+    settings: MotionSettings
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker gives back; the motions stay on the disk where that is possible."""
+
+    rows: list[dict[str, Any]]  # of the report, one a motion
+    file: Path | None  # that keeps the motions, if they could be kept
+    prepared: list[Prepared]  # the motions themselves, if not
+
+    def load(self, root: Path) -> list[Prepared]:
+        """The motions, whose objects are in the cache ``root``.
+
+        Raises:
+            LibraryError: they were kept on the disk and are gone.
+        """
+        stored = None if self.file is None else read_prepared(self.file, root)
+        if stored is None and len(self.prepared) < len(self.rows):
+            raise LibraryError(
+                f"{self.file}: what a worker kept here cannot be read any more. All "
+                f"workers need the same cache folder, and nobody may clean it "
+                f"meanwhile. Start again: what is there is not prepared again."
+            )
+        return self.prepared if stored is None else stored
+
+
+def run_job(job: Job, *, carry: bool = False) -> Outcome:
+    """Prepare one recording, or find it prepared; never raises for its content.
+
+    With ``carry`` the motions come along, for a caller that may not see this disk.
+    """
+    root = job.settings.cache_root
+    try:
+        file = cache_file(job.recording, job.settings)
+    except OSError as error:
+        item = rejected(job.recording.name, [of_error(error)])
+        return Outcome([item.row], None, [item])
+    prepared = read_prepared(file, root)
+    is_kept = prepared is not None
+    if prepared is None:
+        prepared = prepare_recording(job.recording, job.settings)
+        write_prepared(file, prepared)
+        # a disk that refuses the motions or their objects must not cost them
+        is_kept = not carry and read_prepared(file, root) is not None
+    rows = [item.row for item in prepared]
+    return Outcome(rows, file, [] if is_kept and not carry else prepared)
+
+
+def _crashed(job: Job) -> Outcome:
+    """The outcome of a job whose worker died."""
+    text = "the worker process died (out of memory, or a crash in a mesh library)"
+    item = rejected(job.recording.name, [reject("E_CRASH", text)])
+    return Outcome([item.row], None, [item])
 
 
 def run_jobs(
@@ -32,21 +108,13 @@ def run_jobs(
     """Run all jobs; outcomes in the order of the jobs.
 
     Jobs whose meshes nobody has prepared yet come first, so that workers do not wait
-    for one another's convex parts.
-
-    Args:
-        jobs: one a recording.
-        workers: processes; with one, everything happens in this process.
-        ray: use a Ray cluster instead (the extra 'ray').
-        progress: show a bar; by default when standard error is a terminal, else a line
-            now and then.
+    for one another's convex parts. With one worker everything happens in this process.
+    Progress is a bar where standard error is a terminal, else a line now and then.
     """
     order = _new_meshes_first(jobs)
     queue = [jobs[i] for i in order]
     if ray:
-        pass
-
-        stream = run_on_ray(queue)
+        stream = _run_on_ray(queue)
     elif workers > 1:
         stream = _run_in_processes(queue, workers)
     else:
@@ -63,11 +131,11 @@ def run_jobs(
 
 
 def _new_meshes_first(jobs: list[Job]) -> list[int]:
-    seen: set[str] = set()
+    seen: set[Path] = set()
     first, later = [], []
     for i, job in enumerate(jobs):
         files = job.recording.files
-        meshes = {str(f) for f in files if f.suffix.lower() in MESHES}
+        meshes = {f for f in files if f.suffix.lower() in MESH_SUFFIXES}
         (first if meshes - seen else later).append(i)
         seen |= meshes
     return first + later
@@ -84,18 +152,15 @@ def _run_in_processes(jobs: list[Job], workers: int) -> Iterator[tuple[int, Outc
         for place in suspects:  # alone, the one that kills its worker is found
             job = left.pop(place)
             alone = list(_run_pool({place: job}, 1, []))
-            yield alone[0] if alone else (place, crashed(job))
+            yield alone[0] if alone else (place, _crashed(job))
 
 
 def _run_pool(
     jobs: dict[int, Job], workers: int, suspects: list[int]
 ) -> Iterator[tuple[int, Outcome]]:
-    """Run jobs until they are done or the pool breaks.
+    """Run jobs, by place, until they are done or the pool breaks.
 
-    Args:
-        jobs: by place.
-        workers: processes.
-        suspects: filled with the places that were under way when the pool broke.
+    Then ``suspects`` is filled with the places that were under way.
     """
     waiting = list(jobs.items())[::-1]
     running: dict[Future[Outcome], int] = {}
@@ -143,26 +208,17 @@ def _show(
             told = ", ".join(f"{n} {status}" for status, n in sorted(counts.items()))
             bar.set_postfix_str(told, refresh=False)
             bar.update()
-            if bar.disable and progress is None and _is_due(last):
+            due = time.monotonic() - last > LINE_SECONDS
+            if bar.disable and progress is None and due:
                 last = time.monotonic()
                 _LOG.info("prepared %d of %d recordings: %s", done, total, told)
             yield item
 
 
-def _is_due(last: float) -> bool:
-    return time.monotonic() - last > LINE_SECONDS
-
-
-def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
+def _run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
     """Outcomes as they come, with the places of their jobs.
 
     Joins the cluster that ``RAY_ADDRESS`` names, else starts one on this machine.
-
-    Args:
-        jobs: one a recording.
-
-    Raises:
-        MissingExtraError: Ray is not installed.
     """
     try:
         import ray  # pyright: ignore[reportMissingImports]
@@ -181,7 +237,7 @@ def run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
             try:
                 yield place, ray.get(done)
             except ray.exceptions.RayError:
-                yield place, crashed(jobs[place])
+                yield place, _crashed(jobs[place])
     finally:
         if started:
             ray.shutdown()

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from flashdex.datasets.tracks import rotation
+from flashdex.datasets.tracks import missing_frames, rotation
 
 JUMP_SPEED, JUMP_TURN, JUMP_STEP = 5.0, 30.0, 0.03  # m/s, rad/s, m
 JUMP_RATIO = 6.0  # of the usual step around a frame
 USUAL = 7  # steps before and after that tell the usual one
 LONGEST = 2  # frames of an outlier that is repaired
+JUMP_EVENTS = 5  # more make a motion useless
 
 
 def jump_steps(pose: np.ndarray, fps: float) -> np.ndarray:
-    """Steps that are jumps: faster than 5 m/s or 30 rad/s, or 6 times the usual step.
+    """Whether a track jumps from frame t to t + 1, (T - 1,) bool.
+
+    A jump is faster than 5 m/s or 30 rad/s, or 6 times the usual step.
 
     Args:
         pose: (T, 7), NaN where not tracked: a step from or to there is none.
         fps: frames a second.
-
-    Returns:
-        Whether the track jumps from frame t to t + 1, (T - 1,) bool.
     """
     step, turn = _steps(pose, 1)
     return _impossible(step, turn, _usual(step), fps)
@@ -43,9 +43,8 @@ def outliers(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
     bridges = {}
     for k in range(1, LONGEST + 1):
         far, twist = (way / (k + 1) for way in _steps(pose, k + 1))
-        fits = np.isfinite(far)
-        fits &= ~_impossible(far, twist, usual[: len(far)], fps)
-        bridges[k] = fits
+        jumped = _impossible(far, twist, usual[: len(far)], fps)
+        bridges[k] = np.isfinite(far) & ~jumped
     found: list[tuple[int, int]] = []
     for start in np.flatnonzero(jumps) + 1:
         if found and found[-1][1] >= start:
@@ -61,14 +60,13 @@ def outliers(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
 def _steps(pose: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """Distance (m) and angle (rad) from each frame to the one ``stride`` later."""
     before, after = pose[:-stride], pose[stride:]
-    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    known = ~missing_frames(before, after)
     step, turn = np.full(len(before), np.nan), np.full(len(before), np.nan)
     if known.any():
         before, after = before[known], after[known]
         step[known] = np.linalg.norm(after[:, :3] - before[:, :3], axis=-1)
-        turn[known] = (
-            rotation(after[:, 3:]) * rotation(before[:, 3:]).inv()
-        ).magnitude()
+        way = rotation(after[:, 3:]) * rotation(before[:, 3:]).inv()
+        turn[known] = way.magnitude()
     return step, turn
 
 

@@ -7,7 +7,9 @@ longer than 0.1 s is ever made up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +17,6 @@ from flashdex.datasets.demo import (
     MAX_SECONDS,
     MIN_SECONDS,
     QUAT_TOLERANCE,
-    DemoObject,
     HumanDemo,
 )
 from flashdex.datasets.support import demo_support
@@ -30,11 +31,13 @@ from flashdex.datasets.tracks import (
 )
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.checks.recording import FILLED, JUMP_EVENTS, Finding, reject
-from flashdex.motions.repair.jumps import outliers
+from flashdex.motions.findings import Finding, info, reject, status_of, warn
+from flashdex.motions.repair.jumps import JUMP_EVENTS, outliers
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation
 LEAST_TRACKED = 0.2  # share of frames below which a track is not worth keeping
+
+FILLED = "filled"  # key of the provenance: tracks with the frames made up for them
 
 Span = tuple[int, int]
 
@@ -59,7 +62,7 @@ def repair(
     found: list[Finding] = []
     demo = _drop(_blank(demo), 0.0, found)
     found += _check_quats(demo)
-    if not demo.keypoints or not demo.objects or _rejects(found):
+    if status_of(found) == "rejected":
         return [], found
     demo = _smooth(demo, found, limited=not keep_gaps)
     if keep_gaps:
@@ -67,10 +70,6 @@ def repair(
     demo = _drop(demo, LEAST_TRACKED, found)
     pieces, remarks = _split(demo)
     return pieces, found + remarks
-
-
-def _rejects(found: list[Finding]) -> bool:
-    return any(f.level == "reject" for f in found)
 
 
 def _blank(demo: HumanDemo) -> HumanDemo:
@@ -81,7 +80,7 @@ def _blank(demo: HumanDemo) -> HumanDemo:
         keypoints[side] = np.where(gone[:, None, None], np.nan, demo.keypoints[side])
         palm[side] = np.where(gone[:, None], np.nan, demo.palm[side])
     objects = [
-        DemoObject(b.name, b.mesh, np.where(_missing(b.pose)[:, None], np.nan, b.pose))
+        replace(b, pose=np.where(_missing(b.pose)[:, None], np.nan, b.pose))
         for b in demo.objects
     ]
     return replace(demo, keypoints=keypoints, palm=palm, objects=objects)
@@ -111,14 +110,13 @@ def _drop(demo: HumanDemo, share: float, found: list[Finding]) -> HumanDemo:
         what = "hand" if not sides else "object"
         found.append(reject("E_NAN", f"no {what} is tracked in any frame"))
     elif lost:
-        told = "never" if share == 0 else f"in less than {100 * share:.0f} % of frames"
-        level = "info" if share == 0 else "warn"
-        text = f"{', '.join(lost)} left out: tracked {told}"
-        found.append(Finding("E_NAN", level, text))
+        told = f"in less than {100 * share:.0f} % of frames" if share else "never"
+        finding = warn if share else info
+        found.append(finding("E_NAN", f"{', '.join(lost)} left out: tracked {told}"))
     return keep(demo, sides, kept)
 
 
-def keep(demo: HumanDemo, sides: list[Side], objects: list[int]) -> HumanDemo:
+def keep(demo: HumanDemo, sides: Sequence[Side], objects: list[int]) -> HumanDemo:
     """A motion with some of its hands and objects only.
 
     Args:
@@ -126,17 +124,13 @@ def keep(demo: HumanDemo, sides: list[Side], objects: list[int]) -> HumanDemo:
         sides: hands to keep.
         objects: places in ``demo.objects`` to keep, in their new order.
     """
-    place = {old: new for new, old in enumerate(objects)}
+    used = {s: i for s, i in demo.hand_object.items() if s in sides and i in objects}
     return replace(
         demo,
         keypoints={s: demo.keypoints[s] for s in sides},
         palm={s: demo.palm[s] for s in sides},
         objects=[demo.objects[i] for i in objects],
-        hand_object={
-            s: place[i]
-            for s, i in demo.hand_object.items()
-            if s in sides and i in place
-        },
+        hand_object={s: objects.index(i) for s, i in used.items()},
     )
 
 
@@ -159,7 +153,7 @@ def _check_quats(demo: HumanDemo) -> list[Finding]:
             found.append(reject("E_ROT", f"{text}; quaternions are wxyz, unit"))
         else:
             frames = tuple((bad + _first(demo)).tolist())
-            found.append(Finding("E_ROT", "warn", f"{text}; made unit", frames))
+            found.append(warn("E_ROT", f"{text}; made unit", frames))
     return found
 
 
@@ -168,66 +162,58 @@ def _first(demo: HumanDemo) -> int:
     return int(demo.provenance.get("frames", [0])[0])
 
 
-@dataclass
-class _Notes:
-    """What was changed in the tracks of a motion; frames in the recording's numbers."""
-
-    first: int
-    flips: int = 0
-    jumps: list[int] = field(default_factory=list)
-    filled: dict[str, list[list[int]]] = field(default_factory=dict)
-
-    def findings(self, *, limited: bool) -> list[Finding]:
-        found = []
-        if self.flips:
-            text = f"{self.flips} quaternion flips undone"
-            found.append(Finding("I_SIGN", "info", text))
-        if self.jumps:
-            text = f"{len(self.jumps)} jumps there and back, first in frame "
-            many = limited and len(self.jumps) > JUMP_EVENTS
-            text += f"{min(self.jumps)}; {'too many' if many else 'interpolated'}"
-            level = "reject" if many else "warn"
-            found.append(Finding("W_JUMP", level, text, tuple(sorted(self.jumps))))
-        spans = [span for spans in self.filled.values() for span in spans]
-        if spans:
-            closed = sorted({i for a, b in spans for i in range(a, b)})
-            text = f"{len(closed)} frames interpolated, first frame {closed[0]}"
-            found.append(Finding("E_NAN", "info", text, tuple(closed)))
-        return found
-
-
 def _smooth(demo: HumanDemo, found: list[Finding], *, limited: bool) -> HumanDemo:
-    """Every track without flips, outliers and short gaps."""
-    notes = _Notes(_first(demo))
-    keypoints, palm, objects = dict(demo.keypoints), dict(demo.palm), []
+    """Every track without flips, outliers and short gaps; tells what was changed.
+
+    Frames are told in the recording's numbers; the provenance names those made up.
+    """
+    first, flips, jumps, filled = _first(demo), 0, [], {}
+
+    def close(pose: np.ndarray, what: str) -> tuple[np.ndarray, list[Span]]:
+        nonlocal flips
+        pose, count = align_signs(pose)
+        flips += count
+        for start, end in outliers(pose, demo.fps):
+            pose[start:end] = np.nan
+            jumps.append(start + first)
+        gaps = short_gaps(missing_frames(pose), demo.fps)
+        if gaps:
+            filled[what] = [[a + first, b + first] for a, b in gaps]
+        return fill_pose(pose, gaps), gaps
+
+    keypoints, palm = dict(demo.keypoints), dict(demo.palm)
     for side in demo.palm:
-        pose, gaps = _close(demo.palm[side], demo.fps, f"{side} hand", notes)
+        palm[side], gaps = close(demo.palm[side], f"{side} hand")
         points = fill_points(demo.keypoints[side], gaps)
-        points[missing_frames(pose)] = np.nan  # an outlier beside a long gap
-        palm[side], keypoints[side] = pose, points
-    for body in demo.objects:
-        pose, _ = _close(body.pose, demo.fps, f"object {body.name}", notes)
-        objects.append(DemoObject(body.name, body.mesh, pose))
-    found += notes.findings(limited=limited)
-    told = demo.provenance | ({FILLED: notes.filled} if notes.filled else {})
+        points[missing_frames(palm[side])] = np.nan  # an outlier beside a long gap
+        keypoints[side] = points
+    objects = [
+        replace(b, pose=close(b.pose, f"object {b.name}")[0]) for b in demo.objects
+    ]
+    found += _changes(flips, jumps, filled, limited=limited)
+    told = demo.provenance | ({FILLED: filled} if filled else {})
     return replace(
         demo, keypoints=keypoints, palm=palm, objects=objects, provenance=told
     )
 
 
-def _close(
-    pose: np.ndarray, fps: float, what: str, notes: _Notes
-) -> tuple[np.ndarray, list[Span]]:
-    """A pose track without flips, outliers and short gaps, and the gaps closed."""
-    pose, flips = align_signs(pose)
-    notes.flips += flips
-    for start, end in outliers(pose, fps):
-        pose[start:end] = np.nan
-        notes.jumps.append(start + notes.first)
-    gaps = short_gaps(missing_frames(pose), fps)
-    if gaps:
-        notes.filled[what] = [[a + notes.first, b + notes.first] for a, b in gaps]
-    return fill_pose(pose, gaps), gaps
+def _changes(
+    flips: int, jumps: list[int], filled: dict[str, list[list[int]]], *, limited: bool
+) -> list[Finding]:
+    found = []
+    if flips:
+        found.append(info("I_SIGN", f"{flips} quaternion flips undone"))
+    if jumps:
+        many = limited and len(jumps) > JUMP_EVENTS
+        text = f"{len(jumps)} jumps there and back, first in frame {min(jumps)}; "
+        text += "too many" if many else "interpolated"
+        level = "reject" if many else "warn"
+        found.append(Finding("W_JUMP", level, text, tuple(sorted(jumps))))
+    closed = sorted({i for s in filled.values() for a, b in s for i in range(a, b)})
+    if closed:
+        text = f"{len(closed)} frames interpolated, first frame {closed[0]}"
+        found.append(info("E_NAN", text, tuple(closed)))
+    return found
 
 
 def _split(demo: HumanDemo) -> tuple[list[HumanDemo], list[Finding]]:
@@ -245,17 +231,11 @@ def _split(demo: HumanDemo) -> tuple[list[HumanDemo], list[Finding]]:
         start, end = spans[0]
         text = f"not tracked before frame {start} or from frame {end} on; cut off"
         piece = demo.cut(start, end, name=demo.name)
-        return [piece], [Finding("E_NAN", "info", text)]
+        return [piece], [info("E_NAN", text)]
     lost = (demo.num_frames - sum(b - a for a, b in long)) / demo.fps
     text = f"long gaps: {len(long)} cut out of at least {MIN_SECONDS} s, {lost:.1f} s"
-    found = Finding("E_NAN", "warn", f"{text} lost")
     if demo.support_z is None and len(long) > 1:
-        demo = replace(demo, support_z=_table(demo))
-    return [demo.cut(a, b, name=f"{demo.name}_{a}_{b}") for a, b in long], [found]
-
-
-def _table(demo: HumanDemo) -> float | None:
-    try:
-        return demo_support(demo)
-    except MeshError:
-        return None  # every piece says what is wrong with its mesh
+        with suppress(MeshError):  # every piece says what is wrong with its mesh
+            demo = replace(demo, support_z=demo_support(demo))
+    pieces = [demo.cut(a, b, name=f"{demo.name}_{a}_{b}") for a, b in long]
+    return pieces, [warn("E_NAN", f"{text} lost")]

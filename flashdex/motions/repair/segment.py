@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_dilation, uniform_filter1d
+from scipy.spatial import KDTree
 
 from flashdex.datasets.demo import MAX_SECONDS, MIN_SECONDS, HumanDemo
 from flashdex.datasets.support import demo_support
 from flashdex.datasets.tracks import missing_frames, runs
 from flashdex.errors import MeshError
 from flashdex.keys import Side
-from flashdex.motions.checks.recording import FILLED, Finding, reject
 from flashdex.motions.contact.activity import (
     TOUCH_SECONDS,
     Activity,
     bridge,
     find_activity,
 )
-from flashdex.motions.contact.roles import Surfaces, Use, find_use
-from flashdex.motions.repair.repair import keep
+from flashdex.motions.contact.roles import Use, find_use, sample_surfaces
+from flashdex.motions.findings import Finding, info, reject, warn
+from flashdex.motions.repair.repair import FILLED, keep
 from flashdex.objects.meshes import clean_mesh
 
 MARGIN_SECONDS = 0.33
 CALM_SECONDS = 0.5  # a still point is the middle of this long a calm
 
 
-def segment(
-    demo: HumanDemo, meshes: list[trimesh.Trimesh] | None = None
-) -> tuple[list[HumanDemo], list[Finding]]:
+def segment(demo: HumanDemo) -> tuple[list[HumanDemo], list[Finding]]:
     """Cut a session into motions of 1 to 20 s around contact and motion.
 
     A piece begins 0.33 s before a hand is within 2 cm of an object or an object moves,
@@ -41,20 +40,18 @@ def segment(
 
     Args:
         demo: repaired, NaN in long gaps; not changed.
-        meshes: of its objects, cleaned, m; read by default.
 
     Returns:
         Pieces ``<name>_<start>_<end>`` that share the table of the whole session, and
         findings about the session (``concerning`` picks those of a piece).
     """
     found: list[Finding] = []
-    if meshes is None:
-        demo, meshes = _load_meshes(demo, found)
+    demo, meshes = _load_meshes(demo, found)
     if not meshes:
         return [], [*found, reject("E_MESH", "no object has a usable mesh")]
     if demo.support_z is None:
         demo = replace(demo, support_z=demo_support(demo, meshes))
-    session = _Session(demo, find_activity(demo, meshes), Surfaces(meshes))
+    session = _Session(demo, find_activity(demo, meshes), sample_surfaces(meshes))
     windows = _windows(session.activity, demo.fps)
     pieces = [p for a, b in windows for p in session.pieces(a, b)]
     return pieces, found + _remarks(demo, windows, pieces)
@@ -70,8 +67,7 @@ def _load_meshes(
             meshes.append(clean_mesh(body.load_mesh(), name=body.name))
             sound.append(place)
         except MeshError as error:
-            text = f"object '{body.name}' left out: {error}"
-            found.append(Finding("E_MESH", "warn", text))
+            found.append(warn("E_MESH", f"object '{body.name}' left out: {error}"))
     return keep(demo, list(demo.keypoints), sound), meshes
 
 
@@ -85,8 +81,7 @@ def _windows(activity: Activity, fps: float) -> list[tuple[int, int]]:
     cuts = sorted({cut for hand in activity.held for cut in _changes(hand)})
     windows = []
     for start, end in runs(active):
-        marks = [start, *(c for c in cuts if start < c < end), end]
-        windows += list(pairwise(marks))
+        windows += pairwise([start, *(c for c in cuts if start < c < end), end])
     return windows
 
 
@@ -97,22 +92,20 @@ def _changes(held: np.ndarray) -> list[int]:
     return [int(busy[i] + busy[i + 1] + 1) // 2 for i in turns]
 
 
+@dataclass(frozen=True)
 class _Session:
     """A session and what goes on in it; cuts stretches of it into pieces."""
 
-    def __init__(self, demo: HumanDemo, activity: Activity, surfaces: Surfaces) -> None:
-        self.demo = demo
-        self.activity = activity
-        self.surfaces = surfaces
+    demo: HumanDemo
+    activity: Activity
+    surfaces: list[KDTree]
 
     def pieces(self, start: int, end: int) -> list[HumanDemo]:
         """Motions within the frames ``start`` to ``end`` (excluded)."""
         seconds = (end - start) / self.demo.fps
-        use = (
-            None
-            if seconds < MIN_SECONDS
-            else find_use(self.demo, self.activity, self.surfaces, start, end)
-        )
+        if seconds < MIN_SECONDS:
+            return []
+        use = find_use(self.demo, self.activity, self.surfaces, start, end)
         if use is None:
             return []
         spans = self._tracked_spans(use, start, end)
@@ -132,8 +125,7 @@ class _Session:
         if not pattern.any():  # never all at once: wherever one of them comes or goes
             pattern = np.packbits(seen, axis=0)[0]
         edges = np.flatnonzero(np.diff(pattern.astype(int))) + start + 1
-        marks = [start, *edges.tolist(), end]
-        return list(pairwise(marks))
+        return list(pairwise([start, *edges.tolist(), end]))
 
     def _stillest(self, use: Use, start: int, end: int) -> int:
         """Frame of least motion in the middle half."""
@@ -149,9 +141,8 @@ class _Session:
 
     def _cut(self, use: Use, start: int, end: int) -> HumanDemo:
         piece = self.demo.cut(start, end, name=f"{self.demo.name}_{start}_{end}")
-        whole: list[Side] = [
-            s for s, p in piece.palm.items() if not missing_frames(p).any()
-        ]
+        tracked = piece.palm.items()
+        whole: list[Side] = [s for s, p in tracked if not missing_frames(p).any()]
         piece = keep(piece, whole, use.objects)
         slots = {s: use.objects.index(i) for s, i in use.hand_object.items()}
         first, last = piece.provenance["frames"]
@@ -168,19 +159,18 @@ class _Session:
 def _remarks(
     demo: HumanDemo, windows: list[tuple[int, int]], pieces: list[HumanDemo]
 ) -> list[Finding]:
-    idle = demo.seconds - sum(b - a for a, b in windows) / demo.fps
-    used = sum(p.seconds for p in pieces)
     if not pieces:
         text = f"no hand touches an object for {TOUCH_SECONDS} s in a stretch of "
         return [reject("R_INACTIVE", f"{text}{MIN_SECONDS} s")]
-    text = f"{len(pieces)} pieces of {used:.1f} s in all; {idle:.1f} s inactive, "
+    idle = demo.seconds - sum(b - a for a, b in windows) / demo.fps
+    used = sum(p.seconds for p in pieces)
     lost = max(demo.seconds - idle - used, 0.0)
-    text += f"{lost:.1f} s too short or not tracked"
-    found = [Finding("R_INACTIVE", "info", text)]
+    text = f"{len(pieces)} pieces of {used:.1f} s in all; {idle:.1f} s inactive, "
+    found = [info("R_INACTIVE", f"{text}{lost:.1f} s too short or not tracked")]
     for piece in pieces:
         names = piece.provenance.get("objects_left_out")
         if names:
             text = f"{piece.name}: without {', '.join(names)}"
             first = piece.provenance["frames"][0]
-            found.append(Finding("I_OBJECTS", "info", text, (first,)))
+            found.append(info("I_OBJECTS", text, (first,)))
     return found

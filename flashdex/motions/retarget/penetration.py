@@ -12,8 +12,6 @@ from flashdex.hands.attach import add_hand
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import SIDES, Side
 
-TABLE = "table"
-
 
 @dataclass
 class Penetration:
@@ -30,16 +28,14 @@ def make_reference_scene(
 ) -> mujoco.MjModel:
     """Both hands, a table at z = 0 and one mocap body ``object{slot}`` an object.
 
-    Args:
-        specs: left and right hand.
-        parts: per slot the convex parts, vertices (V, 3), m.
+    The parts are vertices (V, 3), m, of an object's convex parts, by slot.
     """
     scene = mujoco.MjSpec()
     scene.option.gravity = np.zeros(3)
     for side in SIDES:
         add_hand(scene, specs[side])
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    scene.worldbody.add_geom(name=TABLE, type=plane, size=[2.0, 2.0, 0.1])
+    scene.worldbody.add_geom(name="table", type=plane, size=[2.0, 2.0, 0.1])
     for slot, hulls in enumerate(parts):
         body = scene.worldbody.add_body(name=f"object{slot}", mocap=True)
         for i, vertices in enumerate(hulls):
@@ -88,9 +84,6 @@ def measure_penetration(
 
 def _owners(model: mujoco.MjModel) -> np.ndarray:
     """0 and 1 for geoms of the left and right hand, 2 for objects, 3 for the table."""
+    prefixes = {"world": 3, "left": 0, "right": 1}
     names = [model.body(int(b)).name for b in model.geom_bodyid]
-    owners = [
-        0 if n.startswith("left_") else 1 if n.startswith("right_") else 2
-        for n in names
-    ]
-    return np.where(model.geom_bodyid == 0, 3, owners)
+    return np.array([prefixes.get(n.split("_")[0], 2) for n in names])

@@ -20,24 +20,23 @@ from torch import Tensor
 from flashdex.datasets.tracks import rotation
 from flashdex.geometry.sdf import SdfGrid
 from flashdex.hands.collision_spheres import HandModel
-from flashdex.hands.jacobian import HandJacobian
-from flashdex.hands.kinematics import HandKinematics
+from flashdex.hands.kinematics import HandJacobian, HandKinematics
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import Side
-from flashdex.motions.retarget.residuals import Residuals, RetargetWeights, Targets
+from flashdex.motions.retarget.residuals import Residuals, RetargetWeights
+from flashdex.motions.retarget.targets import Targets
+
+MAX_STEP = 0.15  # m or rad a joint and iteration
 
 
 def unwrap_wrist(quats: np.ndarray) -> np.ndarray:
-    """Hinge angles with R = Rz(a) Rx(b) R-y(c), continuous over time.
+    """Hinge angles with R = Rz(a) Rx(b) R-y(c), continuous over time, rad, (T, 3).
 
     Each orientation has two solutions, (a, b, c) and (a + pi, pi - b, c + pi); the one
     nearer to the previous frame is taken, up to full turns.
 
     Args:
         quats: wanted orientation of the base, wxyz, (T, 4).
-
-    Returns:
-        rad, (T, 3).
     """
     with warnings.catch_warnings():
         # at the singularity scipy warns and picks a valid solution, which is enough
@@ -56,9 +55,6 @@ def _near(angles: np.ndarray, previous: np.ndarray) -> np.ndarray:
     return angles - 2 * np.pi * np.round((angles - previous) / (2 * np.pi))
 
 
-MAX_STEP = 0.15  # m or rad a joint and iteration
-
-
 @dataclass(frozen=True)
 class Start:
     """Where the iterations of an attempt begin.
@@ -75,41 +71,17 @@ class Start:
     curl: float | None = None
     side: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    @property
-    def is_outside(self) -> bool:
-        """Whether the hand comes to the object from outside."""
-        return self.back > 0
-
-    def shift(self, palm_normal: Tensor) -> Tensor:
-        """Shift of the wrist, m, (T, 2, 3).
-
-        Args:
-            palm_normal: out of the palm, unit, world, (T, 2, 3).
-        """
-        side = torch.tensor(self.side, dtype=palm_normal.dtype)
-        return side - self.back * palm_normal
-
 
 @dataclass
 class RetargetResult:
-    """A joint reference.
+    """A joint reference."""
 
-    Args:
-        joint_pos: m and rad, (T, 2, J).
-        tip_error: robot pad to human tip, m, (T, 2, 5).
-    """
-
-    joint_pos: np.ndarray
-    tip_error: np.ndarray
+    joint_pos: np.ndarray  # m and rad, (T, 2, J)
+    tip_error: np.ndarray  # robot pad to human tip, m, (T, 2, 5)
 
 
 class Retargeter:
-    """Solves joint references for one embodiment.
-
-    Args:
-        specs: the hands to solve for, as returned by ``load_hand``; one or both, and
-            where shapes say 2, as many.
-        weights: of the residuals.
+    """Solves joint references for one hand or both; where shapes say 2, as many.
 
     Example:
         >>> retargeter = Retargeter(load_hand("xhand"))  # doctest: +SKIP
@@ -130,17 +102,15 @@ class Retargeter:
     ) -> RetargetResult:
         """Joint references of all frames of a motion; both hands at once.
 
-        Args:
-            targets: what the human hands and the objects do.
-            sdf: distance grids of the objects, row = slot, float64.
-            start: where the iterations begin; free of contact by default.
+        The distance grids have a row a slot, float64. By default the iterations begin
+        free of contact.
         """
         start = start or Start()
         residuals = Residuals(self.hand, targets, sdf, self.weights)
         free, held = self.weights.free_iterations, self.weights.contact_iterations
         q = self._initial(targets, start)
         for step in range(free + held):
-            q = self._iterate(q, residuals, contact=start.is_outside or step >= free)
+            q = self._iterate(q, residuals, contact=start.back > 0 or step >= free)
         error = (self._kinematics(q)["tip_pos"] - targets.tips).norm(dim=-1)
         return RetargetResult(q.numpy(), error.numpy())
 
@@ -150,7 +120,8 @@ class Retargeter:
         if start.curl is not None:
             low, high = self.hand.low[:, 6:], self.hand.high[:, 6:]
             q[..., 6:] = low + start.curl * (high - low)
-        q[..., :3] = targets.wrist_pos + start.shift(targets.palm_normal)
+        side = torch.tensor(start.side, dtype=q.dtype)
+        q[..., :3] = targets.wrist_pos + (side - start.back * targets.palm_normal)
         for hand in range(q.shape[1]):
             quats = targets.wrist_quat[:, hand].numpy()
             q[:, hand, 3:6] = torch.tensor(unwrap_wrist(quats))
@@ -166,9 +137,8 @@ class Retargeter:
             slope += torch.einsum("thr,thrj->thj", residual, jac)
             curvature += jac.transpose(-1, -2) @ jac
         # a joint at its limit that is pushed outwards takes no part in the step
-        out = ((q <= self.hand.low) & (slope > 0)) | (
-            (q >= self.hand.high) & (slope < 0)
-        )
+        out = (q <= self.hand.low) & (slope > 0)
+        out |= (q >= self.hand.high) & (slope < 0)
         slope = torch.where(out, 0.0, slope)
         curvature = torch.where(out[..., None] | out[..., None, :], 0.0, curvature)
         curvature += torch.diag_embed(out.to(q.dtype))

@@ -12,15 +12,26 @@ followed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from flashdex.geometry.sdf import SdfGrid
-from flashdex.motions.retarget.penetration import Penetration
-from flashdex.motions.retarget.residuals import Targets
+from flashdex.hands.collision_spheres import HandModel
+from flashdex.hands.spec import HandSpec
+from flashdex.keys import SIDES, Side
+from flashdex.motions.contact.roles import Interaction
+from flashdex.motions.retarget.penetration import (
+    Penetration,
+    make_reference_scene,
+    measure_penetration,
+)
+from flashdex.motions.retarget.residuals import RetargetWeights
 from flashdex.motions.retarget.solver import Retargeter, Start
+from flashdex.motions.retarget.targets import Targets, make_targets
+from flashdex.objects.asset import ObjectAsset
+from flashdex.objects.solid import make_slot_grid
 
 PENETRATION_SHARE = 0.5
 JERK_COST = 0.01  # m a rad
@@ -36,21 +47,18 @@ FIXED = (
 BACK, CURL, SIDE = (0.02, 0.12), (0.0, 0.6), 0.03  # ranges of random starts
 
 
+# where the joints of a hand that takes no part rest, m: out of everyone's way
+PARKED = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True)
 class Attempt:
-    """One solution.
+    """One solution; the H hands are those that take part."""
 
-    Args:
-        joint_pos: hands without a part in it parked, m and rad, (T, 2, J).
-        tip_error: robot pad to human tip, m, (T, H, 5), hands that take part.
-        depth: penetration by MuJoCo's collisions.
-        score: m, less is better.
-    """
-
-    joint_pos: np.ndarray
-    tip_error: np.ndarray
-    depth: Penetration
-    score: float
+    joint_pos: np.ndarray  # the other hand is parked, m and rad, (T, 2, J)
+    tip_error: np.ndarray  # robot pad to human tip, m, (T, H, 5)
+    depth: Penetration  # by MuJoCo's collisions
+    score: float  # m, less is better
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,51 @@ class Choice:
 
     best: Attempt
     scores: list[float]
+
+
+def retarget(
+    motion: Interaction,
+    assets: list[ObjectAsset],
+    specs: Mapping[Side, HandSpec],
+    *,
+    weights: RetargetWeights,
+    attempts: int,
+) -> tuple[Choice, Targets]:
+    """Attempts at a joint reference until one is clean; and what both hands aim at.
+
+    Args:
+        motion: with its roles.
+        assets: its objects, by slot.
+        specs: left and right hand.
+        weights: of the residuals.
+        attempts: at most.
+    """
+    targets = make_targets(motion, HandModel(specs))
+    scene = make_reference_scene(specs, [a.parts for a in assets])
+    sdf = make_slot_grid(assets, solid=True)
+    acting = np.flatnonzero(motion.active)
+    used: dict[Side, HandSpec] = {SIDES[h]: specs[SIDES[h]] for h in acting}
+    retargeter = Retargeter(used, weights=weights)
+    aims = targets.of(torch.tensor(acting))
+    made = []
+    for start in make_starts(attempts):
+        result = retargeter.solve(aims, sdf, start=start)
+        joint_pos = np.zeros((motion.num_frames, 2, result.joint_pos.shape[-1]))
+        joint_pos[..., :3] = PARKED
+        joint_pos[:, acting] = result.joint_pos
+        depth = measure_penetration(
+            scene, joint_pos, motion.poses, active=motion.active
+        )
+        deepest = float(depth.objects.max(initial=0.0))
+        fingers = result.joint_pos[..., 6:]
+        jerk = np.abs(np.diff(fingers, n=2, axis=0)).max(initial=0.0)
+        score = float(result.tip_error.mean()) + PENETRATION_SHARE * deepest
+        score += JERK_COST * float(jerk)
+        made.append(Attempt(joint_pos, result.tip_error, depth, score))
+        if deepest < CLEAN_DEPTH and jerk < CLEAN_JERK:
+            break
+    best = min(made, key=lambda attempt: attempt.score)
+    return Choice(best, [round(a.score, 5) for a in made]), targets
 
 
 def make_starts(count: int, *, seed: int = 0) -> list[Start]:
@@ -70,39 +123,3 @@ def make_starts(count: int, *, seed: int = 0) -> list[Start]:
         back, curl = rng.uniform(*BACK), rng.uniform(*CURL)
         starts.append(Start(back=back, curl=curl, side=(x, y, z)))
     return starts
-
-
-def choose_attempt(
-    retargeter: Retargeter,
-    targets: Targets,
-    sdf: SdfGrid,
-    *,
-    count: int,
-    park: Callable[[np.ndarray], np.ndarray],
-    measure: Callable[[np.ndarray], Penetration],
-) -> Choice:
-    """Solve up to ``count`` times and keep the best; a clean solution ends it.
-
-    Args:
-        retargeter: of the H hands that take part.
-        targets: of the same hands.
-        sdf: distance grids of the objects.
-        count: most attempts.
-        park: adds the hands that take no part, (T, H, J) to (T, 2, J).
-        measure: penetration of joint positions (T, 2, J).
-    """
-    attempts = []
-    for start in make_starts(count):
-        result = retargeter.solve(targets, sdf, start=start)
-        joint_pos = park(result.joint_pos)
-        depth = measure(joint_pos)
-        deepest = float(depth.objects.max(initial=0.0))
-        fingers = result.joint_pos[..., 6:]
-        jerk = np.abs(np.diff(fingers, n=2, axis=0)).max(initial=0.0)
-        score = float(result.tip_error.mean()) + PENETRATION_SHARE * deepest
-        score += JERK_COST * float(jerk)
-        attempts.append(Attempt(joint_pos, result.tip_error, depth, score))
-        if deepest < CLEAN_DEPTH and jerk < CLEAN_JERK:
-            break
-    best = min(attempts, key=lambda attempt: attempt.score)
-    return Choice(best, [round(a.score, 5) for a in attempts])

@@ -46,8 +46,9 @@ def refuse_pointer(file: Path) -> None:
     """
     if not file.is_file() and (file.exists() or file.is_symlink()):
         raise DemoError(
-            f"{file}: E_FILE: not a file but a folder, a pipe, a device or a broken "
-            f"link. Put the file itself there."
+            f"{file}: cannot be read: not a file but a folder, a pipe, a device or a "
+            f"broken link. Put the file itself there.",
+            code="E_FILE",
         )
     if file.stat().st_size >= POINTER_SIZE:
         return

@@ -1,10 +1,10 @@
-"""Reads files that hold pickles, without running anything that they ask for.
+"""Reads pickles without running anything that they ask for.
 
-Licensed datasets come as pickles, object arrays and torch files; all are read here and
-only here. A pickle may name what stands in ``ALLOWED``; every other name is refused and
-told. What it names is a stand-in that only keeps what it is given; plain values are
-made of it afterwards, from checked sizes and indices. So no name can be called to an
-effect, and no class of a library is within reach. No file becomes more than 4 GiB.
+Licensed datasets come as pickles, object arrays and torch files (see ``files``). What a
+pickle may name stands in ``ALLOWED``; every other name is refused and told. What it
+names is a stand-in that only keeps what it is given; plain values are made of it
+afterwards, from checked sizes and indices. So no name can be called to an effect, and
+no class of a library is within reach. Nothing becomes more than 4 GiB.
 """
 
 from __future__ import annotations
@@ -15,17 +15,12 @@ import pickle
 import pickletools
 import re
 import struct
-import zipfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import scipy.sparse as sp
-
-from flashdex.datasets.roots import refuse_pointer
-from flashdex.errors import DemoError
 
 MAX_BYTES = 4 << 30  # of what a file becomes; more is a mistake or an attack
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
@@ -37,6 +32,7 @@ STORAGES = {
     **{"ShortStorage": "int16", "CharStorage": "int8", "ByteStorage": "uint8"},
     "BoolStorage": "bool",
 }
+ATOMS = (type(None), bool, int, float, complex, str, bytes, bytearray)
 CONTAINERS, BUSY = (list, tuple, set, frozenset), object()
 OLD_MODULES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
 
@@ -48,7 +44,6 @@ class RefusedError(Exception):
 class StandIn:
     """Keeps what a pickle gives to an object: arguments, and a state or items."""
 
-    make: Callable[[tuple, Any], Any]  # the value, of plain arguments and plain state
     args: tuple
     state: Any
 
@@ -66,17 +61,17 @@ class StandIn:
         self.state = self.state or []
         self.state.append((key, item))
 
+    @staticmethod
+    def make(args: tuple, state: Any) -> Any:
+        """The value, of plain arguments and a plain state."""
+        raise ValueError("a bare class is not data")
+
 
 def _stand_in(make: Callable[[tuple, Any], Any]) -> type[StandIn]:
     return type("StandIn", (StandIn,), {"make": staticmethod(make)})
 
 
-def _refuse_bare(args: tuple, state: Any) -> Any:
-    raise ValueError("a bare class is not data")
-
-
 def _encoded(args: tuple, state: Any) -> bytes:
-    """How protocol 2 keeps bytes."""
     if args[1] not in ("latin1", "latin-1"):
         raise ValueError(f"bytes in the encoding {args[1]!r}")
     return args[0].encode("latin1")
@@ -106,21 +101,9 @@ def _dtype(args: tuple, state: Any) -> np.dtype:
     return np.dtype("O" if code.startswith("O") else code).newbyteorder(order)
 
 
-def _array(args: tuple, state: Any) -> np.ndarray:
-    """``_reconstruct``; the state is (version, shape, dtype, by columns, data)."""
-    if args[0] is not NDARRAY or state is None:
-        raise ValueError("an array of an unknown class, or one without content")
-    shape, dtype, by_columns, data = state[-4:]
-    return _make_array(shape, dtype, "F" if by_columns else "C", data)
-
-
 def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
-    """An array of checked size; nothing is allocated beyond the data at hand.
-
-    The data are bytes or latin-1 text of them, the result is in native byte order; of
-    objects they are the list.
-    """
-    shape = _sizes(shape)
+    """An array of checked size; nothing is allocated beyond the data at hand."""
+    shape = check_sizes(shape)
     if not isinstance(dtype, np.dtype) or order not in ("C", "F"):
         raise ValueError("an array without type or order")
     count = math.prod(shape)
@@ -137,7 +120,7 @@ def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
     return flat.reshape(shape, order=order)
 
 
-def _sizes(given: Any) -> tuple[int, ...]:
+def check_sizes(given: Any) -> tuple[int, ...]:
     """Whole numbers from 0 up."""
     sizes = (given,) if isinstance(given, int) else given
     known = isinstance(sizes, (tuple, list)) and len(sizes) <= 32
@@ -152,21 +135,21 @@ def _chumpy_select(args: tuple, state: Any) -> np.ndarray:
     """Elements of an array, in a new shape."""
     flat = np.asarray(state["a"]).ravel()
     places = np.asarray(state["idxs"], dtype=np.int64)
-    return flat[places].reshape(_sizes(state["preferred_shape"]))
+    return flat[places].reshape(check_sizes(state["preferred_shape"]))
 
 
 def _sparse(kind: Callable[..., Any], args: tuple, state: Any) -> Any:
     """A matrix whose indices are checked: scipy's C code reads where they point."""
     parts = {str(key).lstrip("_"): part for key, part in state.items()}
-    shape = _sizes(parts["shape"])
+    shape = check_sizes(parts["shape"])
     if len(shape) != 2 or math.prod(shape) > MAX_BYTES // 8:
         raise ValueError(f"a sparse matrix of shape {shape}")
     names = ("row", "col") if kind is sp.coo_matrix else ("indices", "indptr")
     pair = parts["coords"] if "coords" in parts else [parts[name] for name in names]
     data, first, second = (np.asarray(part) for part in (parts["data"], *pair))
-    for part, kinds in ((data, "biufc"), (first, "iu"), (second, "iu")):
-        if part.ndim != 1 or (part.size and part.dtype.kind not in kinds):
-            raise ValueError("a sparse matrix whose parts are not rows of numbers")
+    whole = {first.dtype.kind, second.dtype.kind} <= {"i", "u"}
+    if not whole or data.dtype.kind not in "biufc":
+        raise ValueError("a sparse matrix of something else than numbers")
     try:
         if kind is sp.coo_matrix:
             return kind((data, (first, second)), shape)
@@ -206,8 +189,8 @@ def _tensor(args: tuple, state: Any) -> Any:
     import torch
 
     flat = args[0]
-    sizes, strides = (_sizes(part) for part in args[2:4])
-    (offset,) = _sizes(args[1])
+    sizes, strides = (check_sizes(part) for part in args[2:4])
+    (offset,) = check_sizes(args[1])
     if not isinstance(flat, torch.Tensor) or len(sizes) != len(strides):
         raise ValueError("a tensor without storage, or with odd strides")
     # torch would enlarge a storage that is too small: foreign memory shows then
@@ -220,7 +203,7 @@ def _tensor(args: tuple, state: Any) -> Any:
     return flat.as_strided(sizes, strides, offset if count else 0).clone()
 
 
-OBJECT, NDARRAY = _stand_in(_refuse_bare), _stand_in(_refuse_bare)
+OBJECT = _stand_in(StandIn.make)
 ALLOWED: dict[str, type[StandIn]] = {
     "builtins.object": OBJECT,
     "builtins.bytes": _stand_in(lambda args, _: b"".join(args)),  # called on nothing
@@ -231,9 +214,11 @@ ALLOWED: dict[str, type[StandIn]] = {
     ),
     "_codecs.encode": _stand_in(_encoded),
     "copyreg._reconstructor": _stand_in(_old_object),
-    "numpy.ndarray": NDARRAY,
+    "numpy.ndarray": _stand_in(StandIn.make),
     "numpy.dtype": _stand_in(_dtype),
-    "numpy.core.multiarray._reconstruct": _stand_in(_array),
+    "numpy.core.multiarray._reconstruct": _stand_in(
+        lambda _, s: _make_array(s[-4], s[-3], "F" if s[-2] else "C", s[-1])
+    ),
     "numpy.core.multiarray.scalar": _stand_in(
         lambda args, _: _make_array((), args[0], "C", args[1])[()]
     ),
@@ -296,15 +281,24 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
     return kind(file, encoding="latin1").load()
 
 
-def _unpickle(file: IO[bytes]) -> Any:
-    """Plain values of a pickle, in place of its stand-ins."""
+def unpickle(file: IO[bytes]) -> Any:
+    """The content of a pickle, of Python 2 or 3.
+
+    Returns:
+        Plain containers, numbers and texts; numpy arrays; scipy sparse matrices; torch
+        tensors on the CPU without gradient. A chumpy array is a numpy array.
+
+    Raises:
+        RefusedError: it asks for anything else.
+        ValueError: it is damaged; and nearly any other exception.
+    """
     tree = _load(file)
     done: dict[int, Any] = {}
     size = 0
 
     def plain(item: Any) -> Any:
         nonlocal size
-        if item is None or type(item) in (bool, int, float, complex, str):
+        if type(item) in ATOMS:
             return item
         key = id(item)  # stays unique: the tree holds every item until the end
         if key not in done:
@@ -330,137 +324,4 @@ def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
         return type(item)([plain(part) for part in item])
     if type(item) is dict:
         return {plain(key): plain(part) for key, part in item.items()}
-    if type(item) in (bytes, bytearray):
-        return item
     raise ValueError(f"a part that is not data ({type(item).__name__})")
-
-
-def load_pickle(path: Path) -> Any:
-    """The content of a pickle, of Python 2 or 3.
-
-    Returns:
-        Plain containers, numbers and texts; numpy arrays; scipy sparse matrices; torch
-        tensors on the CPU without gradient. A chumpy array is a numpy array.
-
-    Raises:
-        DemoError: the file is missing, damaged, or asks for anything else.
-    """
-    return _guard(path, "pickle", lambda file: _unpickle(io.BytesIO(file.read())))
-
-
-def load_object_array(path: Path) -> Any:
-    """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _guard(path, ".npy array", lambda file: _read_array(file.read()))
-
-
-def load_npz(path: Path, *, only: Collection[str] | None = None) -> dict[str, Any]:
-    """Entries of a ``.npz`` file, each as ``load_object_array`` gives it.
-
-    Args:
-        path: the file.
-        only: names of the entries that are wanted, as far as they are there.
-    """
-    return _guard(path, ".npz archive", lambda file: _read_npz(file, only))
-
-
-def load_arrays(
-    path: Path, *, only: Collection[str] | None = None
-) -> dict[str, np.ndarray]:
-    """As ``load_npz``, of plain arrays: an entry that holds objects is refused."""
-    entries = _guard(path, ".npz without pickles", lambda file: _read_npz(file, only))
-    for name, array in entries.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind == "O":
-            raise DemoError(
-                f"{path}: not a readable .npz without pickles: '{name}' holds objects. "
-                f"Store plain arrays; text as np.array([...], dtype=str)."
-            )
-    return entries
-
-
-def load_torch(path: Path) -> Any:
-    """The content of a file of ``torch.save``: tensors on the CPU, plain containers."""
-    return _guard(path, "torch file", _read_torch)
-
-
-def _guard(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
-    """Read a file; whatever is wrong with it becomes one clear message."""
-    try:
-        refuse_pointer(path)
-        with path.open("rb") as file:
-            return read(file)
-    except DemoError:
-        raise
-    except RefusedError as error:
-        raise DemoError(
-            f"{path}: it tried to load {error}, which is not data, so it was not read. "
-            f"Don't open it with anything else; get the file anew from where the "
-            f"dataset is published.",
-            code="E_PICKLE",
-        ) from error
-    except OSError as error:
-        raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
-    # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
-    except Exception as error:
-        told = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DemoError(
-            f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "
-            f"of another kind; unpack or download it anew."
-        ) from error
-
-
-def _read_array(data: bytes) -> Any:
-    """An array of .npy bytes."""
-    file = io.BytesIO(data)
-    version = np.lib.format.read_magic(file)
-    heads = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in heads:
-        raise ValueError(f"version {version} of the format is not known")
-    shape, by_columns, dtype = heads[version](file)
-    if dtype.kind == "O":
-        array = _unpickle(file)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
-            raise ValueError("an object array that holds something else")
-        return array.item() if array.ndim == 0 else array
-    count = math.prod(_sizes(shape))
-    if dtype.hasobject or count * dtype.itemsize > len(data):
-        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
-    raw = bytearray(file.read(count * dtype.itemsize))
-    return np.frombuffer(raw, dtype, count).reshape(shape, order="CF"[by_columns])
-
-
-def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
-    with zipfile.ZipFile(file) as archive:
-        _check_size(archive)
-        files = [name for name in archive.namelist() if name.endswith(".npy")]
-        if not files:
-            raise ValueError("it holds no .npy entries")
-        names = {name.removesuffix(".npy"): name for name in files}
-        wanted = {k: v for k, v in names.items() if only is None or k in only}
-        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
-
-
-def _check_size(archive: zipfile.ZipFile) -> None:
-    size = sum(member.file_size for member in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
-
-
-def _read_torch(file: IO[bytes]) -> Any:
-    import torch  # slow to import, and few readers need it
-
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            _check_size(archive)
-    file.seek(0)
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL ([\w.]+)", str(error))
-        if found is None:
-            # torch's own text advises to read such a file without care
-            text = "it is torn, or holds more than tensors in plain containers"
-            raise ValueError(text) from error
-        raise RefusedError(found.group(1)) from error

@@ -9,6 +9,7 @@ A clip holds per hand (s = left, right) ``mano_{s}_joints`` (T, 20, 3), named
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from flashdex.datasets.fdr.clip import LICENCE, make_demo
 from flashdex.datasets.fdr.pack import NAME as PACK_NAME
 from flashdex.datasets.fdr.pack import pack_names, pack_objects, unpack
 from flashdex.datasets.fields import words
-from flashdex.datasets.pickles import load_npz
-from flashdex.datasets.roots import refuse_clone, seek_mesh
+from flashdex.datasets.files import load_npz, refuse_clone
+from flashdex.datasets.roots import seek_mesh, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
@@ -27,13 +28,8 @@ CLIP_FOLDERS = ("human_demo", "retargeted")
 
 
 def list_fdr(options: SourceOptions) -> list[Recording]:
-    """Clips of a dataset folder, a folder of clips, one clip, or a ``motion.pt``.
-
-    Raises:
-        DemoError: there are neither clips nor a ``motion.pt``.
-    """
-    assert options.path is not None  # ``Source.needs``
-    clips, pack = _find(options.path)
+    """Clips of a dataset folder, a folder of clips, one clip, or a ``motion.pt``."""
+    clips, pack = _find(options.folder("path"))
     refuse_clone([pack] if pack else clips[:1])
     if pack is not None:
         folders = mesh_folders(pack.parent, options.models)
@@ -71,9 +67,6 @@ def read_clip(file: Path, folders: tuple[Path, ...]) -> list[HumanDemo]:
     Args:
         file: ``<clip>.npz``.
         folders: of meshes, in the order in which they are searched.
-
-    Raises:
-        DemoError: what is missing, or has another shape.
     """
     clip = load_npz(file)
     if "fps" not in clip:
@@ -108,11 +101,11 @@ def _find(path: Path) -> tuple[list[Path], Path | None]:
             return sorted(clips), None
     if (path / PACK_NAME).is_file():
         return [], path / PACK_NAME
-    names = sorted(e.name for e in path.iterdir())[:8] if path.is_dir() else []
     raise DemoError(
-        f"{path}: no clips of FlashDexRetarget (E_ROOT). Sought human_demo/*.npz, "
+        f"{path}: no clips of FlashDexRetarget. Sought human_demo/*.npz, "
         f"*.npz, retargeted/*.npz and motion.pt; found: "
-        f"{', '.join(names) or 'nothing'}. Give the folder that its import writes."
+        f"{shown(path)}. Give the folder that its import writes.",
+        code="E_ROOT",
     )
 
 
@@ -128,16 +121,15 @@ def _ids(clip: Path) -> list[str]:
 
 def _existing(names: list[str], folders: tuple[Path, ...]) -> tuple[Path, ...]:
     """Meshes that exist; reading tells which one is missing or wrong."""
-    found = []
+    found: list[Path | None] = []
     for name in names:
-        try:
+        with suppress(DemoError, OSError):
             found.append(seek_mesh(name, folders))
-        except (DemoError, OSError):
-            continue
     return tuple(file for file in found if file is not None)
 
 
-FDR = Source(
+SOURCE = Source(
+    name="fdr",
     list=list_fdr,
     about="clips of FlashDexRetarget: human_demo/<clip>.npz, or its motion.pt",
     licence=LICENCE,

@@ -155,8 +155,8 @@ def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
     try:
         return make()
     except (DemoError, MeshError) as error:
-        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        return [_reject(name, code, str(error))]
+        other = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
+        return [_reject(name, error.code or other, error.text)]
     except OSError as error:  # a name too long, a folder that may not be entered
         return [_reject(name, "E_FILE", f"cannot be read: {error}")]
     except Exception as error:  # what no check foresaw must not end the others

@@ -123,8 +123,8 @@ def prepare_motion(
         if status_of(findings) != "rejected":
             record = _prepare(demo, settings, findings, row)
     except (DemoError, MeshError) as error:
-        code = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        findings.append(Finding(code, "reject", str(error)))
+        other = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
+        findings.append(Finding(error.code or other, "reject", error.text))
     if settings.strict:
         findings = make_strict(findings)
     row["source"], row["split"], row["task"] = demo.source, demo.split, demo.task

@@ -81,7 +81,7 @@ def prepare(
     cache: an interrupted preparation goes on where it was.
 
     Args:
-        source: name of a reader, see ``flashdex.datasets.SOURCES``.
+        source: name of a reader, see ``flashdex.datasets.source_names``.
         input: what it reads, mostly the dataset's folder.
         hand: robot hand.
         out: directory of the library; an older library there is replaced at the end.

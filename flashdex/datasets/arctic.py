@@ -38,21 +38,13 @@ PARTS = ("top", "bottom")
 
 @dataclass(frozen=True, kw_only=True)
 class ArcticSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        name: ``<subject>/<object>_<action>_<NN>``.
-        meshes: folder of the object's meshes.
-        mano: folder of the hand model.
-        split: of the dataset's protocol, if known.
-    """
+    """Where one sequence lies."""
 
     root: Path
-    name: str
+    name: str  # <subject>/<object>_<action>_<NN>
     meshes: Path
     mano: Path
-    split: str = ""
+    split: str = ""  # of the dataset's protocol, if known
 
     @property
     def words(self) -> list[str]:

@@ -43,18 +43,11 @@ SPLITS = {
 
 @dataclass(frozen=True, kw_only=True)
 class GrabSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        file: of the sequence.
-        models: folder that stands for ``tools/object_meshes/contact_meshes``.
-        mano: folder of the hand model.
-    """
+    """Where one sequence lies."""
 
     root: Path
     file: Path
-    models: Path | None
+    models: Path | None  # in place of tools/object_meshes/contact_meshes
     mano: Path
 
     @property

@@ -55,11 +55,7 @@ def list_myodm(options: SourceOptions) -> list[Recording]:
 
 
 def read_clip(file: Path) -> list[HumanDemo]:
-    """One clip as one motion.
-
-    Args:
-        file: ``clips/<object>_<action>.npz`` of the fetched folder.
-    """
+    """One clip as one motion."""
     data = _load(file)
     root = file.parent.parent
     points = myohand_keypoints(root / "myohand_body.xml", data["robot"])

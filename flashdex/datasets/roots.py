@@ -20,11 +20,6 @@ FAVOURITES = ("visual", "mesh")
 def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
     """Refuse a root that lacks the folders of a dataset.
 
-    Args:
-        root: what the user gave.
-        folders: all of them must be in the root.
-        dataset: for the message.
-
     Raises:
         DemoError: what was sought, what was found, and what is probably meant.
     """
@@ -75,10 +70,6 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
     In each folder in turn: ``<name>.{obj,ply,stl,glb}``, then ``<name>/visual.obj``,
     ``<name>/mesh.obj``, ``<name>/<name>.obj`` (or another suffix), then the only mesh
     in ``<name>/``.
-
-    Args:
-        name: id of the object; a plain name, not a path.
-        folders: where to look, in order.
 
     Raises:
         DemoError: the id is a path, or its folder holds several meshes and none of the

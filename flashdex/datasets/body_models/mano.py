@@ -54,25 +54,15 @@ SAME_SHAPE_DIRS = 1.0
 
 @dataclass(frozen=True)
 class ManoArrays:
-    """What a MANO file holds; float64, metres.
+    """What a MANO file holds; float64, metres."""
 
-    Args:
-        template: vertices of the mean shape, flat open hand, (778, 3).
-        shape_dirs: change of the vertices per shape coefficient, (778, 3, 10).
-        pose_dirs: change of the vertices per element of R - 1, (778, 3, 135).
-        regressor: joints from vertices, (16, 778).
-        weights: of the vertices on the joints, (778, 16).
-        mean: mean finger pose, axis-angle, (45,).
-        components: principal components of finger poses, in rows, (45, 45).
-    """
-
-    template: np.ndarray
-    shape_dirs: np.ndarray
-    pose_dirs: np.ndarray
-    regressor: np.ndarray
-    weights: np.ndarray
-    mean: np.ndarray
-    components: np.ndarray
+    template: np.ndarray  # vertices of the mean shape, flat open hand, (778, 3)
+    shape_dirs: np.ndarray  # their change per shape coefficient, (778, 3, 10)
+    pose_dirs: np.ndarray  # their change per element of R - 1, (778, 3, 135)
+    regressor: np.ndarray  # joints from vertices, (16, 778)
+    weights: np.ndarray  # of the vertices on the joints, (778, 16)
+    mean: np.ndarray  # mean finger pose, axis-angle, (45,)
+    components: np.ndarray  # principal components of finger poses, in rows, (45, 45)
 
 
 def mano_pair(folder: Path) -> tuple[Path, Path]:
@@ -155,16 +145,11 @@ def _wrong(file: Path, text: str) -> DemoError:
 
 @dataclass(frozen=True)
 class ManoModel:
-    """One hand of MANO.
+    """One hand of MANO."""
 
-    Args:
-        side: of the hand.
-        arrays: of its file.
-        left_shape_fixed: whether the sign error of the left shape was corrected.
-    """
-
-    side: Side
-    arrays: ManoArrays
+    side: Side  # of the hand
+    arrays: ManoArrays  # of its file
+    # whether the sign error of the left shape was corrected
     left_shape_fixed: bool = False
 
     def keypoints(
@@ -204,10 +189,7 @@ class ManoModel:
         where: str,
         template: np.ndarray | None = None,
     ) -> np.ndarray:
-        """As ``keypoints``, of axis-angle poses: wrist (T, 3), fingers (T, 45), rad.
-
-        A ``DemoError`` begins with ``where``: they may differ in length.
-        """
+        """As ``keypoints``, of axis-angle poses: wrist (T, 3), fingers (T, 45), rad."""
         counts = {"turn": len(wrist), "fingers": len(fingers)}
         same_length(counts | {"transl": len(translation)}, where=where)
         turns = rotations_from_axis_angle(np.concatenate([wrist, fingers], axis=1))
@@ -227,10 +209,8 @@ class ManoModel:
         With ``flat`` zero coefficients are the flat hand, else the mean pose.
         """
         if coefficients.ndim != 2 or coefficients.shape[1] > 45:
-            raise DemoError(
-                f"MANO coefficients have shape {coefficients.shape}, expected (T, n) "
-                f"with n <= 45."
-            )
+            shape = coefficients.shape
+            raise DemoError(f"MANO coefficients {shape}, expected (T, n), n <= 45.")
         pose = coefficients @ self.arrays.components[: coefficients.shape[1]]
         return pose if flat else self.add_mean(pose)
 
@@ -303,11 +283,8 @@ def _chain(rotations: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndar
 def load_mano(folder: Path, side: Side, *, fix_left_shape: bool = False) -> ManoModel:
     """The model of one hand; kept for the next call.
 
-    Args:
-        folder: with the model files, or one above them (see ``mano_file``).
-        side: of the hand.
-        fix_left_shape: correct the sign error of the released left hand's shape, if
-            this file has it. Only for datasets that were fitted that way.
+    ``fix_left_shape`` corrects the sign error of the released left hand's shape, if
+    this file has it; only for datasets that were fitted that way.
     """
     arrays = read_mano(mano_file(folder, side), side)
     if not fix_left_shape or side == "right":

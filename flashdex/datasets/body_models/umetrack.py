@@ -48,21 +48,14 @@ KEYS = (
 
 @dataclass(frozen=True)
 class UmeTrackHand:
-    """A hand of one person, at rest.
+    """A hand of one person, at rest."""
 
-    Args:
-        axes: of the hinges, unit, (J, 3).
-        origins: of the hinges, m, (J, 3).
-        parents: hinge before each, -1 at the wrist, (J,); always an earlier one.
-        points: keypoints in the 21-order, m, (21, 3).
-        movers: the hinge that moves each keypoint, -1 for the wrist, (21,).
-    """
-
-    axes: np.ndarray
-    origins: np.ndarray
+    axes: np.ndarray  # of the hinges, unit, (J, 3)
+    origins: np.ndarray  # of the hinges, m, (J, 3)
+    # hinge before each, -1 at the wrist, (J,); always an earlier one
     parents: np.ndarray
-    points: np.ndarray
-    movers: np.ndarray
+    points: np.ndarray  # keypoints in the 21-order, m, (21, 3)
+    movers: np.ndarray  # the hinge that moves each keypoint, -1 for the wrist, (21,)
 
     def keypoints(
         self, angles: np.ndarray, wrist: np.ndarray, side: Side
@@ -113,11 +106,7 @@ class UmeTrackHand:
 
 
 def load_umetrack(file: Path) -> UmeTrackHand:
-    """Read a hand profile.
-
-    Args:
-        file: ``umetrack_hand_user_profile.json``.
-    """
+    """Read a hand profile."""
     if not file.exists():
         raise DemoError(
             f"{file}: not found. It holds the hand's bones, which are needed without "

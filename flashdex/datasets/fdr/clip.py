@@ -34,14 +34,7 @@ PALM_IN_WRIST = np.diag([1.0, -1.0, -1.0])
 def make_demo(
     clip: dict[str, Any], file: Path, name: str, folders: tuple[Path, ...]
 ) -> HumanDemo:
-    """A clip's arrays as a motion.
-
-    Args:
-        clip: arrays by the names of ``human_demo/<clip>.npz``.
-        file: they come from, for messages.
-        name: of the motion.
-        folders: of meshes.
-    """
+    """A clip's arrays as a motion."""
     hands: list[Side] = [s for s in SIDES if f"mano_{s}_joints" in clip]
     if not hands:
         raise DemoError(

@@ -48,10 +48,6 @@ def pack_objects(file: Path) -> list[str]:
 def unpack(file: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """The arrays of one clip, by the names of ``human_demo/<clip>.npz``.
 
-    Args:
-        file: the packed collection.
-        row: of the clip.
-
     Returns:
         The clip, with ``fps``, and what is to be told about it.
     """

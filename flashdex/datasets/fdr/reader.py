@@ -17,7 +17,7 @@ from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.fdr.clip import LICENCE, make_demo
 from flashdex.datasets.fdr.pack import NAME as PACK_NAME
 from flashdex.datasets.fdr.pack import pack_names, pack_objects, unpack
-from flashdex.datasets.fields import words
+from flashdex.datasets.fields import require, words
 from flashdex.datasets.files import load_npz, refuse_clone
 from flashdex.datasets.roots import seek_mesh, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
@@ -62,28 +62,16 @@ def mesh_folders(folder: Path, objects: Path | None) -> tuple[Path, ...]:
 
 
 def read_clip(file: Path, folders: tuple[Path, ...]) -> list[HumanDemo]:
-    """One clip as one motion.
-
-    Args:
-        file: ``<clip>.npz``.
-        folders: of meshes, in the order in which they are searched.
-    """
+    """One clip as one motion."""
     clip = load_npz(file)
-    if "fps" not in clip:
-        raise DemoError(f"{file}: lacks fps. Found: {', '.join(sorted(clip))}.")
+    require(clip, "fps", where=str(file))
     demo = make_demo(clip, file, file.stem, folders)
     demo.provenance |= {"files": [file.name]}
     return [demo]
 
 
 def read_packed(file: Path, row: int, folders: tuple[Path, ...]) -> list[HumanDemo]:
-    """One clip of a ``motion.pt`` as one motion.
-
-    Args:
-        file: the packed collection.
-        row: of the clip.
-        folders: of meshes, in the order in which they are searched.
-    """
+    """One clip of a ``motion.pt`` as one motion."""
     clip, notes = unpack(file, row)
     demo = make_demo(clip, file, pack_names(file)[row], folders)
     demo.provenance |= {"files": [file.name], "row": row} | notes

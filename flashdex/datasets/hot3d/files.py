@@ -26,30 +26,19 @@ WRIST = 7  # first columns of a hand's row: position, quaternion wxyz
 
 @dataclass(frozen=True)
 class Track:
-    """Rows of one body.
+    """Rows of one body."""
 
-    Args:
-        times: ns, ascending, (N,) int64.
-        values: a row a time, (N, D).
-    """
-
-    times: np.ndarray
-    values: np.ndarray
+    times: np.ndarray  # ns, ascending, (N,) int64
+    values: np.ndarray  # a row a time, (N, D)
 
 
 @dataclass(frozen=True)
 class Mask:
-    """Rows of a mask file: one per time and camera stream.
+    """Rows of a mask file: one per time and camera stream."""
 
-    Args:
-        times: ns, (N,) int64.
-        streams: such as ``214-1``, (N,).
-        values: whether the frame may be used, (N,) bool.
-    """
-
-    times: np.ndarray
-    streams: np.ndarray
-    values: np.ndarray
+    times: np.ndarray  # ns, (N,) int64
+    streams: np.ndarray  # such as ``214-1``, (N,)
+    values: np.ndarray  # whether the frame may be used, (N,) bool
 
 
 def read_poses(file: Path) -> dict[str, Track]:
@@ -202,20 +191,14 @@ MAX_SECONDS = 4 * 3600  # no session is longer: one wrong stamp would make it ye
 
 @dataclass(frozen=True)
 class FrameAxis:
-    """Uniform frames at 30 fps.
+    """Uniform frames at 30 fps."""
 
-    Args:
-        times: stamp of each frame, ns, ascending, (T,); nominal where a frame was not
-            recorded.
-        recorded: frames that have a stamp of their own, (T,) bool.
-        fps: the rate that was measured.
-        rule: how doubled stamps were told apart.
-    """
-
+    # stamp of each frame, ns, ascending, (T,); nominal where a frame was not
+    # recorded
     times: np.ndarray
-    recorded: np.ndarray
-    fps: float
-    rule: str
+    recorded: np.ndarray  # frames that have a stamp of their own, (T,) bool
+    fps: float  # the rate that was measured
+    rule: str  # how doubled stamps were told apart
 
     def frame_of(self, times: np.ndarray) -> np.ndarray:
         """The frame within 5 ms of each time (ns, (N,)), -1 without one."""

@@ -20,11 +20,7 @@ MIN_NORM = 0.5  # of a quaternion; below, it is a filler and no rotation
 
 @dataclass(frozen=True)
 class ObjectLibrary:
-    """Folder of ``<uid>.glb`` and the names of the objects.
-
-    Args:
-        folder: that holds the models.
-    """
+    """Folder of ``<uid>.glb`` and the names of the objects."""
 
     folder: Path
 
@@ -49,12 +45,7 @@ class ObjectLibrary:
 
 
 def find_library(root: Path, given: Path | None) -> ObjectLibrary:
-    """The object library: the folder given, or one beside or in the dataset.
-
-    Args:
-        root: of the dataset or of one sequence.
-        given: by the user (``--models``); may be one level too high.
-    """
+    """The object library: the folder given, or one beside or in the dataset."""
     if given is not None:
         places = [given, *(given / name for name in LIBRARY_NAMES)]
     else:

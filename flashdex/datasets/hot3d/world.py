@@ -24,22 +24,16 @@ FLATTER = 3.0
 
 @dataclass(frozen=True)
 class Metadata:
-    """What ``metadata.json`` says, in either of its two layouts.
+    """What ``metadata.json`` says, in either of its two layouts."""
 
-    Args:
-        headset: ``Aria``, ``Quest3``.
-        participant: such as ``P0003``.
-        truth: whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a
-            kind of which nothing is said is missing here.
-        names: of the objects, by uid, where they are listed.
-        version: of the dataset, where it is given.
-    """
-
-    headset: str
-    participant: str
+    headset: str  # ``Aria``, ``Quest3``
+    participant: str  # such as ``P0003``
+    # whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a kind
+    # of which nothing is said is missing here
     truth: dict[str, bool] = field(default_factory=dict)
+    # of the objects, by uid, where they are listed
     names: dict[str, str] = field(default_factory=dict)
-    version: str = ""
+    version: str = ""  # of the dataset, where it is given
 
 
 def read_metadata(file: Path) -> Metadata:

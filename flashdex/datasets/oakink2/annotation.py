@@ -35,22 +35,15 @@ Interval = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Primitive:
-    """One item of a program.
+    """One item of a program."""
 
-    Args:
-        intervals: mocap ids (begin, end excluded) in which each hand does its part; a
-            hand with nothing to do is missing.
-        name: of the primitive; empty if it has none.
-        mode: ``lh_main``, ``rh_main`` or ``bh_main``; empty if unknown.
-        hand_objects: object ids of each hand.
-        objects: object ids of both hands, without repeats; empty if unknown.
-    """
-
+    # mocap ids (begin, end excluded) in which each hand does its part; a hand
+    # with nothing to do is missing
     intervals: dict[Side, Interval]
-    name: str
-    mode: str
-    hand_objects: dict[Side, list[str]]
-    objects: list[str]
+    name: str  # of the primitive; empty if it has none
+    mode: str  # ``lh_main``, ``rh_main`` or ``bh_main``; empty if unknown
+    hand_objects: dict[Side, list[str]]  # object ids of each hand
+    objects: list[str]  # object ids of both hands, without repeats; empty if unknown
 
     @property
     def begin(self) -> int:
@@ -140,36 +133,22 @@ def _ids(file: Path, item: dict[str, Any], key: str) -> list[str]:
 
 @dataclass
 class HandTrack:
-    """MANO parameters of one hand; NaN where it was not tracked.
+    """MANO parameters of one hand; NaN where it was not tracked."""
 
-    Args:
-        quats: local joint rotations wxyz, about unit, (T, 16, 4).
-        wrist: m, (T, 3).
-        betas: (T, 10); constant in time as a rule.
-    """
-
-    quats: np.ndarray
-    wrist: np.ndarray
-    betas: np.ndarray
+    quats: np.ndarray  # local joint rotations wxyz, about unit, (T, 16, 4)
+    wrist: np.ndarray  # m, (T, 3)
+    betas: np.ndarray  # (T, 10); constant in time as a rule
 
 
 @dataclass
 class Annotation:
-    """Tracks of one sequence: frame i has the mocap id ``first + i``, 120 a second.
+    """Tracks of one sequence: frame i has the mocap id ``first + i``, 120 a second."""
 
-    Args:
-        first: mocap id of the first frame.
-        num_frames: up to the last id; an id that is missing in between is NaN.
-        hands: both.
-        poses: of each object, m and wxyz, (T, 7).
-        notes: what was repaired.
-    """
-
-    first: int
-    num_frames: int
-    hands: dict[Side, HandTrack]
-    poses: dict[str, np.ndarray]
-    notes: list[str] = field(default_factory=list)
+    first: int  # mocap id of the first frame
+    num_frames: int  # up to the last id; an id that is missing in between is NaN
+    hands: dict[Side, HandTrack]  # both
+    poses: dict[str, np.ndarray]  # of each object, m and wxyz, (T, 7)
+    notes: list[str] = field(default_factory=list)  # what was repaired
 
 
 def read_annotation(file: Path) -> Annotation:
@@ -260,19 +239,12 @@ def _read_hand(
 
 @dataclass(frozen=True, kw_only=True)
 class OakInk2Sequence:
-    """Where one sequence lies.
+    """Where one sequence lies."""
 
-    Attributes:
-        root: of the dataset.
-        token: ``scene_..++...``, the name of its files.
-        mesh_folders: that hold a folder for each object, best first.
-        mano: folder of the hand model.
-    """
-
-    root: Path
-    token: str
-    mesh_folders: tuple[Path, ...]
-    mano: Path
+    root: Path  # of the dataset
+    token: str  # ``scene_..++...``, the name of its files
+    mesh_folders: tuple[Path, ...]  # that hold a folder for each object, best first
+    mano: Path  # folder of the hand model
 
     @property
     def annotation(self) -> Path:

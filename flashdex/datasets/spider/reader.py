@@ -77,12 +77,7 @@ def list_spider(options: SourceOptions) -> list[Recording]:
 
 
 def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
-    """One reference as one motion.
-
-    Args:
-        file: ``trajectory_keypoints.npz``.
-        objects: folder of the meshes, if they lie apart.
-    """
+    """One reference as one motion."""
     data, (info, info_file) = load_npz(file), task_info(file)
     dataset = _dataset(file, info)
     keypoints: dict[Side, np.ndarray] = {}

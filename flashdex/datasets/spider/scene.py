@@ -84,7 +84,7 @@ def _tail(folder: str) -> str:
 
 
 def task_info(file: Path) -> tuple[dict[str, Any], Path | None]:
-    """``task_info.json`` beside a reference or one folder up; empty if there is none."""
+    """``task_info.json`` beside a reference or one folder up; empty without one."""
     for folder in (file.parent, file.parent.parent):
         file = folder / INFO
         if file.is_file():

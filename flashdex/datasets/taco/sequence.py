@@ -31,16 +31,7 @@ LICENCE = "TACO, CC BY 4.0"
 
 @dataclass(frozen=True, kw_only=True)
 class TacoSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        folder: ``(verb, tool, target)/<sequence>``, below both folders of poses.
-        name: of the motion.
-        split: train, test_1 to test_4, or nothing.
-        meshes: file of each mesh id that the sequence names.
-        mano: folder of the hand model.
-    """
+    """Where one sequence lies."""
 
     root: Path
     folder: str

@@ -7,7 +7,20 @@ from collections.abc import Iterable
 
 
 class FlashdexError(Exception):
-    """Base of all errors caused by input; the command line exits with 2 on them."""
+    """Base of all errors caused by input; the command line exits with 2 on them.
+
+    Args:
+        text: what, where, what is allowed, what to do.
+        code: what kind of mistake it is, in one word of ``docs/data.md`` such as
+            ``E_KEYS``; shown before the text, and in the report of a library.
+    """
+
+    def __init__(self, text: str = "", *, code: str | None = None) -> None:
+        super().__init__(text)
+        self.text, self.code = text, code
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.text}" if self.code else str(self.text)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -1,36 +1,62 @@
-"""Readers of recordings, by name: each lists recordings that workers read."""
+"""Readers of recordings, by name: each lists recordings that workers read.
+
+A reader is a module of this folder, or the module ``reader`` of a folder in it, with a
+line ``SOURCE = Source(...)``; module or folder are called like the source. It is found
+by that line and imported when it is asked for. ``register`` makes a reader known that
+lives elsewhere.
+"""
 
 from __future__ import annotations
 
-from flashdex.datasets.arctic import ARCTIC
-from flashdex.datasets.fdr.reader import FDR
-from flashdex.datasets.grab import GRAB
-from flashdex.datasets.hot3d.reader import HOT3D
-from flashdex.datasets.keypoints import KEYPOINTS
-from flashdex.datasets.myodm import MYODM
-from flashdex.datasets.oakink2.reader import OAKINK2
-from flashdex.datasets.procedural.reader import PROCEDURAL
+import importlib
+import re
+from pathlib import Path
+
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.spider.reader import SPIDER
-from flashdex.datasets.taco.reader import TACO
 from flashdex.errors import DemoError, UnknownSourceError
 
 MANO_HINT = (
     "MANO is the hand model of mano.is.tue.mpg.de (registration): give the folder with "
     "MANO_LEFT.pkl and MANO_RIGHT.pkl."
 )
-SOURCES: dict[str, Source] = {
-    "procedural": PROCEDURAL,
-    "keypoints": KEYPOINTS,
-    "myodm": MYODM,
-    "taco": TACO,
-    "oakink2": OAKINK2,
-    "hot3d": HOT3D,
-    "arctic": ARCTIC,
-    "grab": GRAB,
-    "spider": SPIDER,
-    "fdr": FDR,
-}
+REGISTERED: dict[str, Source] = {}
+DEFINED = re.compile(r"^SOURCE = Source\(", re.MULTILINE)
+
+
+def register(source: Source) -> Source:
+    """Make a reader known under its name, in this process."""
+    REGISTERED[source.name] = source
+    return source
+
+
+def source_names() -> list[str]:
+    """All sources, in alphabetical order; no reader is imported."""
+    return sorted({*_modules(), *REGISTERED})
+
+
+def get_source(name: str) -> Source:
+    """The reader of that name.
+
+    Raises:
+        UnknownSourceError: names the known readers.
+    """
+    modules = _modules()
+    if name in REGISTERED:
+        return REGISTERED[name]
+    if name not in modules:
+        raise UnknownSourceError(name, source_names())
+    return importlib.import_module(modules[name]).SOURCE
+
+
+def _modules() -> dict[str, str]:
+    """Module of each reader that is found here."""
+    found = {}
+    for folder in map(Path, __path__):
+        for file in (*folder.glob("*.py"), *folder.glob("*/reader.py")):
+            if DEFINED.search(file.read_text(encoding="utf-8")):
+                parts = file.relative_to(folder).with_suffix("").parts
+                found[parts[0]] = ".".join([__name__, *parts])
+    return found
 
 
 def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
@@ -44,9 +70,7 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
         UnknownSourceError: names the known readers.
         DemoError: an option is missing, or the root is not such a dataset.
     """
-    if source not in SOURCES:
-        raise UnknownSourceError(source, SOURCES)
-    reader = SOURCES[source]
+    reader = get_source(source)
     missing = [name for name in reader.needs if getattr(options, name) is None]
     if missing:
         words = ["--input" if m == "path" else f"--{m}" for m in missing]
@@ -54,9 +78,9 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
         raise DemoError(
             f"{source}: give {' and '.join(words)}. It reads {reader.about}.{hint}"
         )
-    made_up = source == "procedural"  # its input is a word
-    if options.path is not None and not made_up and not options.path.exists():
-        raise DemoError(f"{source}: no such file or folder: {options.path}")
+    path = options.path
+    if path is not None and not reader.made_up and not path.exists():
+        raise DemoError(f"{source}: no such file or folder: {path}")
     if options.limit is not None and options.limit < 1:
         raise DemoError(f"{source}: --limit is {options.limit}; at least 1 is needed.")
     try:
@@ -64,12 +88,13 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     except OSError as error:  # a name too long, a folder that may not be entered
         raise DemoError(f"{source}: cannot be read: {error}.") from error
     if not recordings:
-        raise DemoError(f"{source}: no recordings in {options.path}.")
+        raise DemoError(f"{source}: no recordings in {path}.")
     return recordings if options.limit is None else recordings[: options.limit]
 
 
 def format_sources() -> str:
     """One line a source: its name and what it reads."""
-    width = max(map(len, SOURCES))
-    lines = [f"  {name:<{width}}  {s.about}" for name, s in SOURCES.items()]
+    names = source_names()
+    width = max(map(len, names))
+    lines = [f"  {name:<{width}}  {get_source(name).about}" for name in names]
     return "\n".join(["recordings (flashdex prepare --source NAME):", *lines])

@@ -11,7 +11,6 @@ become two rigid bodies.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,17 +18,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.body_models.mano import (
-    load_mano,
-    mano_pair,
-    rotations_from_axis_angle,
-)
+from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import MAX_SECONDS, DemoObject, HumanDemo
 from flashdex.datasets.fields import part, pose_track, same_length, to_array, track
-from flashdex.datasets.pickles import load_object_array
-from flashdex.datasets.roots import refuse_clone, relative, require_folders, scaled_mesh
+from flashdex.datasets.files import load_npy, read_json, refuse_clone, told
+from flashdex.datasets.roots import relative, require_folders, require_mesh, scaled_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.tracks import missing_frames, palm_frame
+from flashdex.datasets.tracks import missing_frames
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
@@ -43,26 +38,18 @@ PARTS = ("top", "bottom")
 
 @dataclass(frozen=True, kw_only=True)
 class ArcticSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        name: ``<subject>/<object>_<action>_<NN>``.
-        meshes: folder of the object's meshes.
-        mano: folder of the hand model.
-        split: of the dataset's protocol, if known.
-    """
+    """Where one sequence lies."""
 
     root: Path
-    name: str
+    name: str  # <subject>/<object>_<action>_<NN>
     meshes: Path
     mano: Path
-    split: str = ""
+    split: str = ""  # of the dataset's protocol, if known
 
     @property
-    def object(self) -> str:
-        """The object's name."""
-        return Path(self.name).name.split("_")[0]
+    def words(self) -> list[str]:
+        """Object and action."""
+        return Path(self.name).name.split("_")[:2]
 
     def file(self, kind: str) -> Path:
         """``<name>.<kind>.npy``; kinds are mano and object."""
@@ -76,14 +63,8 @@ class ArcticSequence:
 
 
 def list_arctic(options: SourceOptions) -> list[Recording]:
-    """All sequences, in name order.
-
-    Raises:
-        DemoError: the root is not ARCTIC's, or MANO or the split list is at fault.
-    """
-    root, mano = options.path, options.mano
-    assert root is not None  # ``Source.needs``
-    assert mano is not None
+    """All sequences, in name order."""
+    root, mano = options.folder("path"), options.folder("mano")
     folders = (SEQUENCES,) if options.models else (SEQUENCES, TEMPLATES)
     require_folders(root, folders, dataset="ARCTIC")
     models = mano_pair(mano)
@@ -108,20 +89,17 @@ def list_arctic(options: SourceOptions) -> list[Recording]:
         )
     if not recordings:
         raise DemoError(
-            f"{root / SEQUENCES}: no <subject>/<object>_<action>_<NN>.mano.npy "
-            f"(E_ROOT). Unpack raw_seqs.zip there."
+            f"{root / SEQUENCES}: no <subject>/<object>_<action>_<NN>.mano.npy. "
+            f"Unpack raw_seqs.zip there.",
+            code="E_ROOT",
         )
     refuse_clone(recordings[0].files[:1])
     return recordings
 
 
 def read_sequence(sequence: ArcticSequence) -> list[HumanDemo]:
-    """One sequence as one motion.
-
-    Raises:
-        DemoError: a file is missing or wrong, or tracks differ in length.
-    """
-    hands = load_object_array(sequence.file("mano"))
+    """One sequence as one motion."""
+    hands = load_npy(sequence.file("mano"))
     keypoints: dict[Side, np.ndarray] = {
         s: _read_hand(sequence, hands, s) for s in SIDES
     }
@@ -134,13 +112,12 @@ def read_sequence(sequence: ArcticSequence) -> list[HumanDemo]:
             name=sequence.name.replace("/", "_"),
             fps=FPS,
             keypoints=keypoints,
-            palm={side: palm_frame(track, side) for side, track in keypoints.items()},
             objects=bodies,
-            source="arctic",
-            licence=ARCTIC.licence,
+            source=SOURCE.name,
+            licence=SOURCE.licence,
             needs_cutting=frames / FPS > MAX_SECONDS,
             split=sequence.split,
-            task=" ".join(Path(sequence.name).name.split("_")[:2]),
+            task=" ".join(sequence.words),
             provenance={
                 "files": [relative(f, sequence.root) for f in sequence.files()],
                 "fps": FPS,
@@ -158,26 +135,23 @@ def read_sequence(sequence: ArcticSequence) -> list[HumanDemo]:
 
 
 def _read_hand(sequence: ArcticSequence, hands: object, side: Side) -> np.ndarray:
-    where = f"{sequence.file('mano')}: {side} hand"
-    hand = part(hands, side, where=str(sequence.file("mano")))
+    file = str(sequence.file("mano"))
+    hand, where = part(hands, side, where=file), f"{file}: {side} hand"
     model = load_mano(sequence.mano, side)
-    fingers = model.add_mean(track(hand, "pose", 45, where=where))
-    turn, place = (track(hand, key, 3, where=where) for key in ("rot", "trans"))
-    same_length(
-        {"rot": len(turn), "pose": len(fingers), "trans": len(place)}, where=where
-    )
-    return model.keypoints(
-        rotations_from_axis_angle(np.concatenate([turn, fingers], axis=1)),
-        to_array(part(hand, "shape", where=where), 10, what=f"{where}: shape"),
-        place,
+    return model.keypoints_of(
+        track(hand, "rot", 3, where=where),
+        model.add_mean(track(hand, "pose", 45, where=where)),
+        track(hand, "trans", 3, where=where),
+        betas=to_array(part(hand, "shape", where=where), 10, what=f"{where}: shape"),
         convention="joint",
+        where=where,
     )
 
 
 def _read_objects(sequence: ArcticSequence) -> list[DemoObject]:
     """The top, turned about the hinge, and the bottom."""
     file = sequence.file("object")
-    stored = track({"array": load_object_array(file)}, "array", 7, where=str(file))
+    stored = track({"array": load_npy(file)}, "array", 7, where=str(file))
     seen = ~missing_frames(stored)
     turns = Rotation.from_rotvec(stored[seen, 1:4])
     place = stored[:, 4:] * MILLIMETRE
@@ -185,14 +159,10 @@ def _read_objects(sequence: ArcticSequence) -> list[DemoObject]:
     bodies = []
     for name, turn in zip(PARTS, (opened, turns), strict=True):
         mesh = sequence.meshes / f"{name}.obj"
-        if not mesh.is_file():
-            raise DemoError(
-                f"{mesh}: mesh not found (E_FILE). Unpack meta.zip, or name the folder "
-                f"of object_vtemplates with --models."
-            )
+        require_mesh(mesh, "Unpack meta.zip, or name the folder of object_vtemplates")
         body = scaled_mesh(mesh, MILLIMETRE)
         pose = pose_track(turn, place, seen)
-        bodies.append(DemoObject(f"{sequence.object}_{name}", body, pose))
+        bodies.append(DemoObject(f"{sequence.words[0]}_{name}", body, pose))
     return bodies
 
 
@@ -200,20 +170,17 @@ def _read_splits(file: Path, *, given: Path | None) -> dict[str, str]:
     """Split by sequence, from a protocol of the dataset; empty if there is none."""
     if given is None and not file.is_file():
         return {}
-    try:
-        protocol = json.loads(file.read_text(encoding="utf-8"))
+    fault = (
+        "not a JSON object of splits, each a list of <subject>/<sequence>, as in "
+        "splits_json/protocol_p1.json"
+    )
+    with told(file, fault):
+        protocol = read_json(file, fault)
         return {str(n): str(s) for s, names in protocol.items() for n in names}
-    except (
-        *(OSError, ValueError, AttributeError),
-        *(TypeError, RecursionError),
-    ) as error:
-        raise DemoError(
-            f"{file}: expected a JSON object of splits, each a list of "
-            f"<subject>/<sequence>, as in splits_json/protocol_p1.json: {error}"
-        ) from error
 
 
-ARCTIC = Source(
+SOURCE = Source(
+    name="arctic",
     list=list_arctic,
     about="ARCTIC: raw_seqs and meta/object_vtemplates; needs MANO",
     licence="ARCTIC: non-commercial research, no redistribution",

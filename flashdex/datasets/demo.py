@@ -9,13 +9,17 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
+from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import load_mesh
 
-MIN_FRAMES = 10
-MIN_SECONDS = 0.5
+MIN_SECONDS, MAX_SECONDS = 1.0, 20.0  # of a motion
+# below these a recording is refused as it is read
+LEAST_FRAMES, LEAST_SECONDS = 10, 0.5
 QUAT_TOLERANCE = 1e-2
+# turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
+UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
 
 
 @dataclass
@@ -49,7 +53,8 @@ class HumanDemo:
         keypoints: per recorded hand (T, 21, 3), m, world; 0 wrist, then four a finger
             from the thumb to the pinky.
         palm: per recorded hand (T, 7): wrist position (m) and quaternion (wxyz) of the
-            palm frame: x to the middle MCP, z out of the palm.
+            palm frame: x to the middle MCP, z out of the palm. By default it is that
+            of the keypoints.
         objects: the objects of the scene.
         hand_object: which object (its place in ``objects``) a hand uses; a hand that
             is missing here is assigned by contact.
@@ -72,8 +77,8 @@ class HumanDemo:
     name: str
     fps: float
     keypoints: dict[Side, np.ndarray]
-    palm: dict[Side, np.ndarray]
-    objects: list[DemoObject]
+    palm: dict[Side, np.ndarray] = field(default_factory=dict)
+    objects: list[DemoObject] = field(default_factory=list)
     hand_object: dict[Side, int] = field(default_factory=dict)
     source: str = ""
     licence: str = ""
@@ -83,6 +88,12 @@ class HumanDemo:
     split: str = ""
     task: str = ""
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Fill in the palms; where keypoints have a wrong shape, validation tells."""
+        for side, points in self.keypoints.items():
+            if side not in self.palm and points.shape[1:] == (21, 3):
+                self.palm[side] = palm_frame(points, side)
 
     @property
     def num_frames(self) -> int:
@@ -177,11 +188,11 @@ class HumanDemo:
             )
 
     def _check_length(self) -> None:
-        if self.num_frames < MIN_FRAMES or self.seconds < MIN_SECONDS:
+        if self.num_frames < LEAST_FRAMES or self.seconds < LEAST_SECONDS:
             raise DemoError(
                 f"{self.name}: too short: {self.num_frames} frames, "
-                f"{self.seconds:.2f} s; at least {MIN_FRAMES} frames and "
-                f"{MIN_SECONDS} s are needed."
+                f"{self.seconds:.2f} s; at least {LEAST_FRAMES} frames and "
+                f"{LEAST_SECONDS} s are needed."
             )
 
     def cut(self, start: int, end: int, *, name: str) -> HumanDemo:
@@ -205,10 +216,3 @@ class HumanDemo:
             needs_cutting=False,
             provenance=self.provenance | {"frames": [first + start, first + end]},
         )
-
-
-# turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
-UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
-
-
-MIN_SECONDS, MAX_SECONDS = 1.0, 20.0

@@ -1,4 +1,4 @@
-"""Entries of a file as what they should be: numbers, one number, one text."""
+"""Entries of a file as what they should be: numbers, texts, tracks, poses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.tracks import continuous, missing_frames, to_quat
 from flashdex.errors import DemoError
+
+ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
+LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def numbers(value: Any, *, what: str) -> np.ndarray:
@@ -23,25 +26,32 @@ def numbers(value: Any, *, what: str) -> np.ndarray:
         DemoError: it holds something else, or rows of different lengths.
     """
     try:
-        array = np.asarray(value)
+        array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
         if array.dtype.kind not in "fiub":
             raise TypeError(f"it holds {array.dtype}")
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         told = " ".join(str(error).split())[:120]
-        raise DemoError(f"{what}: E_KEYS: not numbers: {told}.") from error
+        text = f"{what}: not numbers but a {type(value).__name__}: {told}."
+        raise DemoError(text, code="E_KEYS") from error
     return array.astype(np.float64)
 
 
 def number(value: Any, *, what: str) -> float:
-    """One real number, in an array of any rank or alone.
-
-    Raises:
-        DemoError: it is something else.
-    """
+    """One real number, in an array of any rank or alone."""
     array = numbers(value, what=what)
     if array.size != 1:
-        raise DemoError(f"{what}: E_KEYS: shape {array.shape}; expected one number.")
+        text = f"{what}: shape {array.shape}; expected one number."
+        raise DemoError(text, code="E_KEYS")
     return float(array.reshape(()))
+
+
+def to_array(value: Any, size: int, *, what: str) -> np.ndarray:
+    """Numbers of known count, flat, (size,); axes of length one do not matter."""
+    array = numbers(value, what=f"{what}, expected {size} numbers")
+    if array.size != size:
+        text = f"{what}: shape {array.shape}; expected {size} numbers."
+        raise DemoError(text, code="E_KEYS")
+    return array.reshape(size)
 
 
 def words(value: Any) -> list[str]:
@@ -52,47 +62,75 @@ def words(value: Any) -> list[str]:
 
 
 def word(value: Any, *, what: str) -> str:
-    """One text, in an array of any rank or alone.
-
-    Raises:
-        DemoError: there are none or several.
-    """
+    """One text, in an array of any rank or alone."""
     found = words(value)
     if len(found) != 1:
-        raise DemoError(f"{what}: E_KEYS: {len(found)} entries; expected one text.")
+        text = f"{what}: {len(found)} entries; expected one text."
+        raise DemoError(text, code="E_KEYS")
     return found[0]
 
 
-ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
-LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+def require(data: Any, *keys: str, where: str) -> None:
+    """Refuse a table that lacks a key; the message shows what is there."""
+    known = data if isinstance(data, Mapping) else {}
+    if missing := [key for key in keys if key not in known]:
+        found = ", ".join(map(str, known)) or f"a {type(data).__name__}"
+        text = f"{where}: lacks {', '.join(missing)}. Found: {found[:200]}."
+        raise DemoError(text, code="E_KEYS")
 
 
-def to_array(value: Any, size: int, *, what: str) -> np.ndarray:
-    """A number array or tensor of known size, flat.
+def part(data: Any, key: str, *, where: str) -> Any:
+    """One entry of a table."""
+    require(data, key, where=where)
+    return data[key]
+
+
+def track(data: Any, key: str, *shape: int, where: str) -> np.ndarray:
+    """One track of a table, (T, *shape) float64, T at least 1.
 
     Args:
-        value: anything; a tensor may need a gradient.
-        size: numbers it must hold; axes of length one do not matter.
-        what: file and key, for the message.
-
-    Returns:
-        (size,) float64.
+        data: the table: a mapping of names to arrays.
+        key: of the track.
+        shape: of one frame.
+        where: file and part of it, for messages.
 
     Raises:
-        DemoError: it is not that.
+        DemoError: the key is missing or its shape is another one.
     """
-    try:
-        plain = value.detach().cpu().numpy() if hasattr(value, "detach") else value
-        array = np.asarray(plain, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise DemoError(
-            f"{what}: E_KEYS: a {type(value).__name__}; expected {size} numbers."
-        ) from error
-    if array.size != size:
-        raise DemoError(
-            f"{what}: E_KEYS: shape {array.shape}; expected {size} numbers."
-        )
-    return array.reshape(size)
+    values = numbers(part(data, key, where=where), what=f"{where}: {key}")
+    if not len(np.atleast_1d(values)) or values.shape[1:] != shape or not values.ndim:
+        told = ", ".join(["T", *map(str, shape)])
+        text = f"{where}: {key} has shape {values.shape}; expected ({told})."
+        raise DemoError(text, code="E_KEYS")
+    return values
+
+
+def same_length(lengths: Mapping[str, int], *, where: str) -> int:
+    """The number of frames that all tracks have.
+
+    Raises:
+        DemoError: they differ.
+    """
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {count}" for name, count in lengths.items())
+        text = f"{where}: frames differ: {told}. Get the file anew."
+        raise DemoError(text, code="E_LEN")
+    return next(iter(lengths.values()))
+
+
+def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Position and quaternion wxyz without sign flips, NaN in unseen frames, (T, 7).
+
+    Args:
+        turns: rotations of the seen frames.
+        positions: m, (T, 3).
+        seen: frames that were tracked, (T,).
+    """
+    pose = np.full((len(positions), 7), np.nan)
+    if seen.any():
+        pose[seen, :3] = positions[seen]
+        pose[seen, 3:] = continuous(to_quat(turns))
+    return pose
 
 
 def poses_from_matrices(
@@ -112,9 +150,8 @@ def poses_from_matrices(
         DemoError: wrong shape, a transposed transform, or a reflection.
     """
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
-        raise DemoError(
-            f"{what}: E_KEYS: shape {matrices.shape}; expected (T, 4, 4) transforms."
-        )
+        text = f"{what}: shape {matrices.shape}; expected (T, 4, 4) transforms."
+        raise DemoError(text, code="E_KEYS")
     seen = ~missing_frames(matrices)
     if not seen.any():
         return np.full((len(matrices), 7), np.nan), []
@@ -129,74 +166,11 @@ def poses_from_matrices(
     return pose, [f"{text}{frames[skew][0]}"] if skew.any() else []
 
 
-def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Position and quaternion wxyz without sign flips, NaN in unseen frames, (T, 7).
-
-    Args:
-        turns: rotations of the seen frames.
-        positions: m, (T, 3).
-        seen: frames that were tracked, (T,).
-    """
-    pose = np.full((len(positions), 7), np.nan)
-    if seen.any():
-        pose[seen, :3] = positions[seen]
-        pose[seen, 3:] = continuous(to_quat(turns))
-    return pose
-
-
 def _refuse(bad: np.ndarray, frames: np.ndarray, what: str, fault: str) -> None:
     if bad.any():
         raise DemoError(
-            f"{what}: E_ROT: frame {frames[bad][0]} is not a rigid transform: its "
-            f"{fault} is wrong. Expected a rotation (determinant 1) and a position in "
-            f"the last column; the last row is 0 0 0 1."
+            f"{what}: frame {frames[bad][0]} is not a rigid transform: its {fault} is "
+            f"wrong. Expected a rotation (determinant 1) and a position in the last "
+            f"column; the last row is 0 0 0 1.",
+            code="E_ROT",
         )
-
-
-def track(data: Any, key: str, width: int, *, where: str) -> np.ndarray:
-    """One track of a table, (T, width) float64.
-
-    Args:
-        data: the table: a mapping of names to arrays.
-        key: of the track.
-        width: numbers a frame.
-        where: file and part of it, for messages.
-
-    Raises:
-        DemoError: the key is missing or its shape is another one.
-    """
-    stored = part(data, key, where=where)
-    try:
-        values = np.asarray(stored, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DemoError(f"{where}: {key} holds no numbers (E_KEYS).") from error
-    if values.ndim != 2 or values.shape[1] != width or not len(values):
-        raise DemoError(
-            f"{where}: {key} has shape {values.shape}; expected (T, {width}) (E_KEYS)."
-        )
-    return values
-
-
-def part(data: Any, key: str, *, where: str) -> Any:
-    """One entry of a table, whatever it is.
-
-    Raises:
-        DemoError: the key is missing.
-    """
-    if not isinstance(data, Mapping) or key not in data:
-        kind = type(data).__name__
-        found = ", ".join(map(str, data)) if isinstance(data, Mapping) else f"a {kind}"
-        raise DemoError(f"{where}: lacks {key} (E_KEYS). Found: {found}.")
-    return data[key]
-
-
-def same_length(lengths: Mapping[str, int], *, where: str) -> int:
-    """The number of frames that all tracks have.
-
-    Raises:
-        DemoError: they differ.
-    """
-    if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in lengths.items())
-        raise DemoError(f"{where}: frames differ: {told} (E_LEN). Get the file anew.")
-    return next(iter(lengths.values()))

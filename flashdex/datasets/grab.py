@@ -18,17 +18,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.body_models.mano import (
-    load_mano,
-    mano_pair,
-    rotations_from_axis_angle,
-)
+from flashdex.datasets.body_models.mano import NUM_VERTICES, load_mano, mano_pair
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import number, part, pose_track, same_length, track, word
-from flashdex.datasets.pickles import load_npz
-from flashdex.datasets.roots import refuse_clone, relative, require_folders
+from flashdex.datasets.files import load_npz, refuse_clone
+from flashdex.datasets.roots import relative, require_folders, require_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.tracks import missing_frames, palm_frame, rotation
+from flashdex.datasets.tracks import missing_frames, rotation
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import load_mesh
@@ -37,26 +33,21 @@ FPS = 120.0
 SEQUENCES, TOOLS = "grab", "tools"
 MESHES = "object_meshes/contact_meshes"  # below TOOLS
 HANDS: dict[Side, str] = {"left": "lhand", "right": "rhand"}
-NUM_VERTICES = 778
 # objects of the dataset's own test and validation splits; the others are for training
-TEST = ("mug", "wineglass", "camera", "binoculars", "fryingpan", "toothpaste")
-VALIDATION = ("apple", "toothbrush", "elephant", "hand")
+SPLITS = {
+    **dict.fromkeys(("mug", "wineglass", "camera", "binoculars"), "test"),
+    **dict.fromkeys(("fryingpan", "toothpaste"), "test"),
+    **dict.fromkeys(("apple", "toothbrush", "elephant", "hand"), "val"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GrabSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        file: of the sequence.
-        models: folder that stands for ``tools/object_meshes/contact_meshes``.
-        mano: folder of the hand model.
-    """
+    """Where one sequence lies."""
 
     root: Path
     file: Path
-    models: Path | None
+    models: Path | None  # in place of tools/object_meshes/contact_meshes
     mano: Path
 
     @property
@@ -72,9 +63,7 @@ class GrabSequence:
     @property
     def split(self) -> str:
         """By object, as the dataset's own preprocessing has it."""
-        return {**dict.fromkeys(TEST, "test"), **dict.fromkeys(VALIDATION, "val")}.get(
-            self.object, "train"
-        )
+        return SPLITS.get(self.object, "train")
 
     def mesh(self, stored: str) -> Path:
         """The file that a path in the sequence names."""
@@ -95,42 +84,34 @@ class GrabSequence:
 
 
 def list_grab(options: SourceOptions) -> list[Recording]:
-    """All sequences, in name order.
-
-    Raises:
-        DemoError: the root is not GRAB's, or MANO is missing.
-    """
-    root, mano = options.path, options.mano
-    assert root is not None  # ``Source.needs``
-    assert mano is not None
+    """All sequences, in name order."""
+    root, mano = options.folder("path"), options.folder("mano")
     require_folders(root, (SEQUENCES, TOOLS), dataset="GRAB")
     models = mano_pair(mano)
     files = sorted((root / SEQUENCES).glob("s*/*.npz"))
     if not files:
         raise DemoError(
-            f"{root / SEQUENCES}: no s1 ... s10/<object>_<action>_<take>.npz (E_ROOT). "
-            f"Unpack the archives with GRAB's grab/unzip_grab.py."
+            f"{root / SEQUENCES}: no s1 ... s10/<object>_<action>_<take>.npz. "
+            f"Unpack the archives with GRAB's grab/unzip_grab.py.",
+            code="E_ROOT",
         )
     refuse_clone(files[:1])
-    recordings = []
-    for file in files:
-        sequence = GrabSequence(root=root, file=file, models=options.models, mano=mano)
-        recordings.append(
-            Recording(
-                name=sequence.name,
-                read=partial(read_sequence, sequence),
-                files=(*sequence.files(), *models),
-            )
+    sequences = [
+        GrabSequence(root=root, file=file, models=options.models, mano=mano)
+        for file in files
+    ]
+    return [
+        Recording(
+            name=sequence.name,
+            read=partial(read_sequence, sequence),
+            files=(*sequence.files(), *models),
         )
-    return recordings
+        for sequence in sequences
+    ]
 
 
 def read_sequence(sequence: GrabSequence) -> list[HumanDemo]:
-    """One sequence as one motion.
-
-    Raises:
-        DemoError: a part or a mesh is missing or wrong, or tracks differ in length.
-    """
+    """One sequence as one motion."""
     data, where = load_npz(sequence.file), str(sequence.file)
     keypoints: dict[Side, np.ndarray] = {
         s: _read_hand(sequence, data, s) for s in SIDES
@@ -146,10 +127,9 @@ def read_sequence(sequence: GrabSequence) -> list[HumanDemo]:
             name=sequence.name,
             fps=fps,
             keypoints=keypoints,
-            palm={side: palm_frame(track, side) for side, track in keypoints.items()},
             objects=[DemoObject(name, mesh, pose)],
-            source="grab",
-            licence=GRAB.licence,
+            source=SOURCE.name,
+            licence=SOURCE.licence,
             support_z=height,
             split=sequence.split,
             task=word(data.get("motion_intent", ""), what=f"{where}: motion_intent"),
@@ -169,24 +149,20 @@ def _read_hand(sequence: GrabSequence, data: dict[str, Any], side: Side) -> np.n
     hand = part(data, HANDS[side], where=str(sequence.file))
     params = part(hand, "params", where=where)
     model = load_mano(sequence.mano, side)
-    turn, place = (
-        track(params, k, 3, where=where) for k in ("global_orient", "transl")
-    )
     if "fullpose" in params:
         fingers = track(params, "fullpose", 45, where=where)
     else:
         width = int(number(data.get("n_comps", 24), what=f"{where}: n_comps"))
         coefficients = track(params, "hand_pose", width, where=where)
         fingers = model.finger_pose(coefficients, flat=True)
-    same_length(
-        {"turn": len(turn), "fingers": len(fingers), "transl": len(place)}, where=where
-    )
-    return model.keypoints(
-        rotations_from_axis_angle(np.concatenate([turn, fingers], axis=1)),
-        None,
-        place,
+    return model.keypoints_of(
+        track(params, "global_orient", 3, where=where),
+        fingers,
+        track(params, "transl", 3, where=where),
+        betas=None,
         convention="joint",
         template=_template(sequence, str(part(hand, "vtemp", where=where))),
+        where=where,
     )
 
 
@@ -216,11 +192,7 @@ def _read_body(
     )
     same_length({"global_orient": len(turn), "transl": len(place)}, where=where)
     mesh = sequence.mesh(str(part(body, f"{key}_mesh", where=where)))
-    if not mesh.is_file():
-        raise DemoError(
-            f"{where}: mesh {mesh} not found (E_FILE). Unpack tools.zip, or name the "
-            f"folder of contact_meshes with --models."
-        )
+    require_mesh(mesh, "Unpack tools.zip, or name the folder of contact_meshes")
     seen = ~missing_frames(turn, place)
     # v R + t turns by the transpose of R
     return pose_track(Rotation.from_rotvec(turn[seen]).inv(), place, seen), mesh
@@ -243,7 +215,8 @@ def _support(sequence: GrabSequence, data: dict[str, Any]) -> tuple[float | None
     return float(top), "top of the table's mesh in its recorded pose"
 
 
-GRAB = Source(
+SOURCE = Source(
+    name="grab",
     list=list_grab,
     about="GRAB: grab/s*/*.npz and tools/; needs MANO",
     licence="GRAB: non-commercial research, no redistribution",

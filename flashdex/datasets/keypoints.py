@@ -9,7 +9,6 @@ end; end excluded) cuts recordings into motions called ``<clip>_<start>_<end>``.
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 
@@ -17,11 +16,9 @@ import numpy as np
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import number, numbers
-from flashdex.datasets.pickles import load_arrays
-from flashdex.datasets.roots import refuse_pointer
+from flashdex.datasets.files import load_npz, read_json, told
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.support import demo_support
-from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 
@@ -30,17 +27,11 @@ KEYS = (
     *("kp_left", "kp_right", "palm_left", "palm_right"),
 )
 REQUIRED = ("fps", "object", "obj_pose")
-SOURCE = "keypoints"
 
 
 def list_keypoints(options: SourceOptions) -> list[Recording]:
-    """Recordings of a folder or one file, in name order.
-
-    Raises:
-        DemoError: there are none, or a ``segments*.json`` is wrong.
-    """
-    path = options.path
-    assert path is not None  # ``Source.needs``
+    """Recordings of a folder or one file, in name order."""
+    path = options.folder("path")
     files = [path] if path.is_file() else sorted(path.glob("*.npz"))
     if not files:
         raise DemoError(
@@ -75,7 +66,7 @@ def read_keypoints(path: str | Path) -> list[HumanDemo]:
 
 def read_file(file: Path) -> HumanDemo:
     """One recording, uncut."""
-    data = load_arrays(file, only=KEYS)
+    data = load_npz(file, only=KEYS, plain=True)
     missing = [key for key in REQUIRED if key not in data]
     hands: list[Side] = [side for side in SIDES if f"kp_{side}" in data]
     if missing or not hands:
@@ -84,26 +75,22 @@ def read_file(file: Path) -> HumanDemo:
     keypoints: dict[Side, np.ndarray] = {
         s: numbers(data[f"kp_{s}"], what=f"{file}: kp_{s}") for s in hands
     }
+    palm: dict[Side, np.ndarray] = {
+        s: numbers(data[f"palm_{s}"], what=f"{file}: palm_{s}")
+        for s in hands
+        if f"palm_{s}" in data
+    }
     licence = file.parent / "LICENSE"
     return HumanDemo(
         name=file.stem,
         fps=number(data["fps"], what=f"{file}: fps"),
         keypoints=keypoints,
-        palm={s: _read_palm(data, s, keypoints) for s in hands},
+        palm=palm,
         objects=_read_objects(file, data),
-        source=SOURCE,
+        source=SOURCE.name,
         licence=str(licence.name) if licence.is_file() else "",
         provenance={"files": [file.name]},
     )
-
-
-def _read_palm(data: dict, side: Side, keypoints: dict[Side, np.ndarray]) -> np.ndarray:
-    stored, points = data.get(f"palm_{side}"), keypoints[side]
-    if stored is not None:
-        return numbers(stored, what=f"palm_{side}")
-    if points.ndim != 3 or points.shape[1:] != (21, 3):
-        return np.full((len(points), 7), np.nan)  # validation says what is wrong
-    return palm_frame(points, side)
 
 
 def _read_objects(file: Path, data: dict) -> list[DemoObject]:
@@ -132,7 +119,7 @@ def _mesh_file(file: Path, name: str) -> Path:
 def _mesh_files(file: Path) -> tuple[Path, ...]:
     """Meshes that a recording names; none where it cannot be read (yet)."""
     try:
-        names = np.atleast_1d(load_arrays(file, only=["object"])["object"])
+        names = np.atleast_1d(load_npz(file, only=["object"], plain=True)["object"])
         meshes = [_mesh_file(file, str(name)) for name in names]
         return tuple(mesh for mesh in meshes if mesh.is_file())
     except (OSError, KeyError, DemoError):
@@ -143,16 +130,11 @@ def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
     """Pieces (start, end) of each recording, from all ``segments*.json``."""
     pieces: dict[str, list[tuple[int, int]]] = {}
     for file in sorted(folder.glob("segments*.json")):
-        try:
-            refuse_pointer(file)
-            rows = json.loads(file.read_text(encoding="utf-8"))
-            for row in rows:
+        fault = "not a list of {clip, start, end}"
+        with told(file, fault):
+            for row in read_json(file, fault):
                 span = (int(row["start"]), int(row["end"]))
                 pieces.setdefault(str(row["clip"]), []).append(span)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise DemoError(
-                f"{file}: expected a list of {{clip, start, end}}: {error!r}"
-            ) from error
     return pieces
 
 
@@ -176,7 +158,8 @@ def _support(demo: HumanDemo) -> float | None:
         return None  # each piece is judged on its own; some may be sound
 
 
-KEYPOINTS = Source(
+SOURCE = Source(
+    name="keypoints",
     list=list_keypoints,
     about="a folder of <clip>.npz with keypoints and object poses, or one such file",
 )

@@ -8,8 +8,8 @@ tree. z up, table top at z = 0. Keypoints come from the hand's forward kinematic
 
 from __future__ import annotations
 
-import json
 import re
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -18,9 +18,9 @@ import numpy as np
 from flashdex.datasets.body_models.myohand import NUM_JOINTS, myohand_keypoints
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fetch import NOTE, myodm_dir
-from flashdex.datasets.pickles import load_arrays
+from flashdex.datasets.fields import require
+from flashdex.datasets.files import load_npz, read_json
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 
 FPS = 50.0
@@ -35,11 +35,7 @@ OBJECT_NAME = re.compile(r"[a-z]+")
 
 
 def list_myodm(options: SourceOptions) -> list[Recording]:
-    """Clips of the fetched folder, in name order.
-
-    Raises:
-        DemoError: the folder is missing or not such a folder.
-    """
+    """Clips of the fetched folder, in name order."""
     root = options.path or myodm_dir()
     hand = root / "myohand_body.xml"
     clips = sorted((root / "clips").glob("*.npz"))
@@ -59,14 +55,7 @@ def list_myodm(options: SourceOptions) -> list[Recording]:
 
 
 def read_clip(file: Path) -> list[HumanDemo]:
-    """One clip as one motion.
-
-    Args:
-        file: ``clips/<object>_<action>.npz`` of the fetched folder.
-
-    Raises:
-        DemoError: names the file and what is wrong in it.
-    """
+    """One clip as one motion."""
     data = _load(file)
     root = file.parent.parent
     points = myohand_keypoints(root / "myohand_body.xml", data["robot"])
@@ -79,10 +68,9 @@ def read_clip(file: Path) -> list[HumanDemo]:
             name=file.stem,
             fps=FPS,
             keypoints={"right": points},
-            palm={"right": palm_frame(points, "right")},
             objects=[DemoObject(name, _mesh_file(file), pose)],
-            source="myodm",
-            licence=NOTE,
+            source=SOURCE.name,
+            licence=SOURCE.licence,
             support_z=None if name in SUNK else 0.0,
             task=file.stem.removeprefix(f"{name}_"),
             provenance={
@@ -96,9 +84,8 @@ def read_clip(file: Path) -> list[HumanDemo]:
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    stored = load_arrays(file, only=KEYS)
-    if missing := [key for key in KEYS if key not in stored]:
-        raise DemoError(f"{file}: not a MyoDM clip: lacks {', '.join(missing)}.")
+    stored = load_npz(file, only=KEYS, plain=True)
+    require(stored, *KEYS, where=f"{file}: not a MyoDM clip")
     data = {key: stored[key] for key in KEYS}
     if data["time"].ndim != 1 or data["time"].dtype.kind != "f":
         raise DemoError(f"{file}: 'time' must be a list of seconds, (T,).")
@@ -130,16 +117,16 @@ def _mesh_file(clip: Path) -> Path:
 def _origin(root: Path) -> dict[str, str]:
     """Package and hash of the fetched folder; nothing for a folder made by hand."""
     file = root / "source.json"
-    try:
-        if not file.is_file():
-            return {}
-        stored = json.loads(file.read_text(encoding="utf-8"))
-        return {"package": str(stored["source"]), "sha256": str(stored["sha256"])}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    if not file.is_file():
         return {}
+    with suppress(DemoError, KeyError, TypeError):
+        stored = read_json(file, "not JSON")
+        return {"package": str(stored["source"]), "sha256": str(stored["sha256"])}
+    return {}
 
 
-MYODM = Source(
+SOURCE = Source(
+    name="myodm",
     list=list_myodm,
     about="the folder of `flashdex fetch myodm` (found by itself)",
     licence=NOTE,

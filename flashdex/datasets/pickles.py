@@ -1,9 +1,10 @@
-"""Reads files that hold pickles, without running anything that they ask for.
+"""Reads pickles without running anything that they ask for.
 
-Licensed datasets come as pickles, object arrays and torch files. All of them are read
-here and only here: the names that data need are allowed and met with stand-ins
-(``stand_ins``); every other name is refused and told. Plain numpy arrays are read
-by their announced size. No file becomes more than 4 GiB.
+Licensed datasets come as pickles, object arrays and torch files (see ``files``). What a
+pickle may name stands in ``ALLOWED``; every other name is refused and told. What it
+names is a stand-in that only keeps what it is given; plain values are made of it
+afterwards, from checked sizes and indices. So no name can be called to an effect, and
+no class of a library is within reach. Nothing becomes more than 4 GiB.
 """
 
 from __future__ import annotations
@@ -11,49 +12,228 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import zipfile
-from collections.abc import Callable, Collection
-from pathlib import Path
+import pickletools
+import re
+import struct
+from collections.abc import Callable
+from functools import partial
 from typing import IO, Any
 
 import numpy as np
+import scipy.sparse as sp
 
-from flashdex.datasets.stand_ins import arrays, containers, sparse, tensors
-from flashdex.datasets.stand_ins.base import (
-    MAX_BYTES,
-    RefusedError,
-    StandIn,
-    check_pickle,
-    check_sizes,
-)
-from flashdex.errors import DemoError
-
-LFS = b"version https://git-lfs"
-OLD_MODULES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
-SPARSE = {
-    "csc_matrix": sparse.SparseColumns,
-    "csr_matrix": sparse.SparseRows,
-    "coo_matrix": sparse.Sparse,
+MAX_BYTES = 4 << 30  # of what a file becomes; more is a mistake or an attack
+DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
+# what an old torch file begins with, its version, and the storages it may hold
+MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001
+STORAGES = {
+    **{"DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16"},
+    **{"BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32"},
+    **{"ShortStorage": "int16", "CharStorage": "int8", "ByteStorage": "uint8"},
+    "BoolStorage": "bool",
 }
-ALLOWED: dict[str, Any] = {
-    "numpy.ndarray": arrays.ArrayType,
-    "numpy.dtype": arrays.Dtype,
-    "numpy.core.multiarray._reconstruct": arrays.Array,
-    "numpy.core.multiarray.scalar": arrays.Scalar,
-    "numpy.core.numeric._frombuffer": arrays.BufferArray,
-    "_codecs.encode": containers.Encoded,
-    "copyreg._reconstructor": containers.Reconstructor,
-    "builtins.object": containers.ObjectType,
-    "builtins.bytes": containers.NoBytes,
-    "builtins.set": containers.MutableSet,
-    "builtins.frozenset": containers.FrozenSet,
-    "collections.OrderedDict": containers.Ordered,
-    "chumpy.ch.Ch": arrays.Chumpy,
-    "chumpy.reordering.Select": arrays.ChumpySelect,
-    "torch.storage._load_from_bytes": tensors.Storage,
-    "torch._utils._rebuild_tensor": tensors.Tensor,
-    "torch._utils._rebuild_tensor_v2": tensors.Tensor,
-    "torch._utils._rebuild_parameter": tensors.Parameter,
+ATOMS = (type(None), bool, int, float, complex, str, bytes, bytearray)
+CONTAINERS, BUSY = (list, tuple, set, frozenset), object()
+OLD_MODULES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
+
+
+class RefusedError(Exception):
+    """A pickle asks for something that is not data; the text is its name."""
+
+
+class StandIn:
+    """Keeps what a pickle gives to an object: arguments, and a state or items."""
+
+    args: tuple
+    state: Any
+
+    def __new__(cls, *args: Any) -> StandIn:
+        """Keep the arguments here: pickles may skip ``__init__``."""
+        made = object.__new__(cls)
+        made.args, made.state = args, None
+        return made
+
+    # Every stand-in takes its state here: pickle would set attributes otherwise.
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def __setitem__(self, key: Any, item: Any) -> None:
+        self.state = self.state or []
+        self.state.append((key, item))
+
+    @staticmethod
+    def make(args: tuple, state: Any) -> Any:
+        """The value, of plain arguments and a plain state."""
+        raise ValueError("a bare class is not data")
+
+
+def _stand_in(make: Callable[[tuple, Any], Any]) -> type[StandIn]:
+    return type("StandIn", (StandIn,), {"make": staticmethod(make)})
+
+
+def _encoded(args: tuple, state: Any) -> bytes:
+    if args[1] not in ("latin1", "latin-1"):
+        raise ValueError(f"bytes in the encoding {args[1]!r}")
+    return args[0].encode("latin1")
+
+
+def _bytes(data: Any) -> Any:
+    return data.encode("latin1") if isinstance(data, str) else data
+
+
+def _old_object(args: tuple, state: Any) -> Any:
+    """``copyreg._reconstructor``: an object of an old pickle."""
+    kind, base, content = args
+    if not issubclass(kind, StandIn) or base is not OBJECT or content is not None:
+        raise ValueError("an old-style object that is not plain")
+    return kind.make((), state)
+
+
+def _dtype(args: tuple, state: Any) -> np.dtype:
+    """Numbers, texts or objects; the state is (version, byte order, no parts, ...)."""
+    state = state or (3, "|", None, None, None)
+    if not isinstance(args[0], str) or not DTYPE_CODE.fullmatch(args[0]):
+        raise ValueError(f"the array type {args[0]!r} is not plain")
+    if any(part is not None for part in state[2:5]):
+        raise ValueError(f"the array type {args[0]!r} has parts")
+    code = args[0].lstrip("|<>=")
+    order = state[1] if state[1] in ("<", ">") else "="
+    return np.dtype("O" if code.startswith("O") else code).newbyteorder(order)
+
+
+def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
+    """An array of checked size; nothing is allocated beyond the data at hand."""
+    shape = check_sizes(shape)
+    if not isinstance(dtype, np.dtype) or order not in ("C", "F"):
+        raise ValueError("an array without type or order")
+    count = math.prod(shape)
+    if dtype.hasobject:
+        if not isinstance(data, list) or len(data) != count:
+            raise ValueError(f"an array of shape {shape} without that many objects")
+        return np.fromiter(data, object, count).reshape(shape, order=order)
+    raw, size = _bytes(data), count * dtype.itemsize
+    if not isinstance(raw, (bytes, bytearray)) or len(raw) != size:
+        raise ValueError(f"an array of shape {shape} whose data are not {size} bytes")
+    if dtype.itemsize == 0:
+        return np.zeros(shape, dtype)
+    flat = np.frombuffer(raw, dtype).astype(dtype.newbyteorder("="))
+    return flat.reshape(shape, order=order)
+
+
+def check_sizes(given: Any) -> tuple[int, ...]:
+    """Whole numbers from 0 up."""
+    sizes = (given,) if isinstance(given, int) else given
+    known = isinstance(sizes, (tuple, list)) and len(sizes) <= 32
+    if not known or not all(
+        isinstance(n, (int, np.integer)) and 0 <= n <= MAX_BYTES for n in sizes
+    ):
+        raise ValueError(f"{given!r} are not sizes")
+    return tuple(int(n) for n in sizes)
+
+
+def _chumpy_select(args: tuple, state: Any) -> np.ndarray:
+    """Elements of an array, in a new shape."""
+    flat = np.asarray(state["a"]).ravel()
+    places = np.asarray(state["idxs"], dtype=np.int64)
+    return flat[places].reshape(check_sizes(state["preferred_shape"]))
+
+
+def _sparse(kind: Callable[..., Any], args: tuple, state: Any) -> Any:
+    """A matrix whose indices are checked: scipy's C code reads where they point."""
+    parts = {str(key).lstrip("_"): part for key, part in state.items()}
+    shape = check_sizes(parts["shape"])
+    if len(shape) != 2 or math.prod(shape) > MAX_BYTES // 8:
+        raise ValueError(f"a sparse matrix of shape {shape}")
+    names = ("row", "col") if kind is sp.coo_matrix else ("indices", "indptr")
+    pair = parts["coords"] if "coords" in parts else [parts[name] for name in names]
+    data, first, second = (np.asarray(part) for part in (parts["data"], *pair))
+    whole = {first.dtype.kind, second.dtype.kind} <= {"i", "u"}
+    if not whole or data.dtype.kind not in "biufc":
+        raise ValueError("a sparse matrix of something else than numbers")
+    try:
+        if kind is sp.coo_matrix:
+            return kind((data, (first, second)), shape)
+        matrix = kind((data, first, second), shape)
+        matrix.check_format(full_check=True)
+    except ValueError as error:
+        raise ValueError(f"a sparse matrix that is not sound: {error}") from error
+    return matrix
+
+
+def _storage(args: tuple, state: Any) -> Any:
+    """Numbers of one storage, flat, on the CPU, whatever device they came from.
+
+    Every tensor of a pickle holds a whole torch file in the old layout. ``torch.load``
+    takes a quarter of a millisecond for each: minutes with ten tensors a frame.
+    """
+    import torch  # slow to import, and few readers need it
+
+    file = io.BytesIO(_bytes(args[0]))
+    magic, version, system, storage, keys = (_load(file, _Head) for _ in range(5))
+    kind, name, key, _, length = storage[:5]
+    whole = kind == "storage" and keys == [key] and not any(storage[5:])
+    if not whole or name not in STORAGES or not system["little_endian"]:
+        raise ValueError("a torch storage that is not plain, or a view of another")
+    if (magic, version) != (MAGIC, VERSION):
+        raise ValueError("a torch storage of an unknown kind")
+    dtype = getattr(torch, STORAGES[name])
+    (told,) = struct.unpack("<q", file.read(8))
+    data = bytearray(file.read())
+    if told != length or len(data) != told * dtype.itemsize:
+        raise ValueError(f"a torch storage of {length} numbers in {len(data)} bytes")
+    return torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
+
+
+def _tensor(args: tuple, state: Any) -> Any:
+    """A view of a storage as a tensor of its own, without gradient."""
+    import torch
+
+    flat = args[0]
+    sizes, strides = (check_sizes(part) for part in args[2:4])
+    (offset,) = check_sizes(args[1])
+    if not isinstance(flat, torch.Tensor) or len(sizes) != len(strides):
+        raise ValueError("a tensor without storage, or with odd strides")
+    # torch would enlarge a storage that is too small: foreign memory shows then
+    last = offset + sum((n - 1) * s for n, s in zip(sizes, strides, strict=True))
+    count = math.prod(sizes)
+    if count and last >= flat.numel():
+        raise ValueError(f"a tensor of shape {sizes} that leaves its storage")
+    if count * flat.element_size() > MAX_BYTES:
+        raise ValueError(f"a tensor of shape {sizes} becomes more than 4 GiB")
+    return flat.as_strided(sizes, strides, offset if count else 0).clone()
+
+
+OBJECT = _stand_in(StandIn.make)
+ALLOWED: dict[str, type[StandIn]] = {
+    "builtins.object": OBJECT,
+    "builtins.bytes": _stand_in(lambda args, _: b"".join(args)),  # called on nothing
+    "builtins.set": _stand_in(lambda args, _: set(*args)),
+    "builtins.frozenset": _stand_in(lambda args, _: frozenset(*args)),
+    "collections.OrderedDict": _stand_in(
+        lambda args, items: dict([*(args[0] if args else ()), *(items or ())])
+    ),
+    "_codecs.encode": _stand_in(_encoded),
+    "copyreg._reconstructor": _stand_in(_old_object),
+    "numpy.ndarray": _stand_in(StandIn.make),
+    "numpy.dtype": _stand_in(_dtype),
+    "numpy.core.multiarray._reconstruct": _stand_in(
+        lambda _, s: _make_array(s[-4], s[-3], "F" if s[-2] else "C", s[-1])
+    ),
+    "numpy.core.multiarray.scalar": _stand_in(
+        lambda args, _: _make_array((), args[0], "C", args[1])[()]
+    ),
+    "numpy.core.numeric._frombuffer": _stand_in(  # pickle protocol 5
+        lambda args, _: _make_array(args[2], args[1], args[3], args[0])
+    ),
+    "scipy.sparse.csc_matrix": _stand_in(partial(_sparse, sp.csc_matrix)),
+    "scipy.sparse.csr_matrix": _stand_in(partial(_sparse, sp.csr_matrix)),
+    "scipy.sparse.coo_matrix": _stand_in(partial(_sparse, sp.coo_matrix)),
+    "chumpy.ch.Ch": _stand_in(lambda _, state: np.asarray(state["x"])),
+    "chumpy.reordering.Select": _stand_in(_chumpy_select),
+    "torch.storage._load_from_bytes": _stand_in(_storage),
+    "torch._utils._rebuild_tensor": _stand_in(_tensor),
+    "torch._utils._rebuild_tensor_v2": _stand_in(_tensor),
+    "torch._utils._rebuild_parameter": _stand_in(lambda args, _: args[0]),
 }
 
 
@@ -62,8 +242,8 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         top = OLD_MODULES.get(module, module).replace("numpy._core", "numpy.core")
-        if top.startswith("scipy.sparse") and name in SPARSE:
-            return SPARSE[name]
+        # ten years of scipy kept its matrices in as many modules
+        top = "scipy.sparse" if top.startswith("scipy.sparse.") else top
         if f"{top}.{name}" not in ALLOWED or "." in name:
             raise RefusedError(f"{module}.{name}")
         return ALLOWED[f"{top}.{name}"]
@@ -72,7 +252,36 @@ class _Unpickler(pickle.Unpickler):
         raise RefusedError(f"an object outside of the file ({str(pid)[:40]})")
 
 
-def load_pickle(path: Path) -> Any:
+class _Head(_Unpickler):
+    """Reads the head of an old torch file, which names one storage."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        is_storage = module == "torch" and name in STORAGES
+        return name if is_storage else super().find_class(module, name)
+
+    def persistent_load(self, pid: Any) -> Any:
+        return pid
+
+
+def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
+    """One pickle, read over once from its start to its end before it builds anything.
+
+    The pickle machine itself allocates whatever a length or a place in its memo says,
+    tens of gigabytes for ten bytes of file; after this check both are true.
+    """
+    start, puts = file.tell(), 0
+    for code, part, _ in pickletools.genops(file):
+        if code.name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            if not isinstance(part, int) or part > puts:
+                raise pickle.UnpicklingError("the memo of the pickle is not in order")
+            puts += 1
+        elif code.name == "MEMOIZE":
+            puts += 1
+    file.seek(start)
+    return kind(file, encoding="latin1").load()
+
+
+def unpickle(file: IO[bytes]) -> Any:
     """The content of a pickle, of Python 2 or 3.
 
     Returns:
@@ -80,200 +289,39 @@ def load_pickle(path: Path) -> Any:
         tensors on the CPU without gradient. A chumpy array is a numpy array.
 
     Raises:
-        DemoError: the file is missing, damaged, or asks for anything else.
+        RefusedError: it asks for anything else.
+        ValueError: it is damaged; and nearly any other exception.
     """
-    return _guard(path, "pickle", lambda file: _unpickle(file))
-
-
-def load_object_array(path: Path) -> Any:
-    """The content of a ``.npy`` file, pickled or not.
-
-    Returns:
-        The array; of a pickled array without dimensions, its only element.
-
-    Raises:
-        DemoError: as ``load_pickle``.
-    """
-    size = path.stat().st_size if path.is_file() else 0
-    return _guard(path, ".npy array", lambda file: _read_array(file, size))
-
-
-def load_npz(path: Path, *, only: Collection[str] | None = None) -> dict[str, Any]:
-    """The entries of a ``.npz`` file, each as ``load_object_array`` gives it.
-
-    Args:
-        path: the file.
-        only: names of the entries that are wanted, as far as they are there.
-
-    Raises:
-        DemoError: as ``load_pickle``, or an entry announces more than 4 GiB.
-    """
-    return _guard(path, ".npz archive", lambda file: _read_npz(file, only))
-
-
-def load_arrays(
-    path: Path, *, only: Collection[str] | None = None
-) -> dict[str, np.ndarray]:
-    """The entries of a ``.npz`` file of plain arrays.
-
-    Args:
-        path: the file.
-        only: names of the entries that are wanted, as far as they are there.
-
-    Raises:
-        DemoError: as ``load_npz``, or an entry holds objects.
-    """
-    entries = _guard(path, ".npz without pickles", lambda file: _read_npz(file, only))
-    for name, array in entries.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind == "O":
-            raise DemoError(
-                f"{path}: not a readable .npz without pickles: '{name}' holds objects. "
-                f"Store plain arrays; text as np.array([...], dtype=str)."
-            )
-    return entries
-
-
-def load_torch(path: Path) -> Any:
-    """The content of a file of ``torch.save``: tensors on the CPU, plain containers.
-
-    Raises:
-        DemoError: as ``load_pickle``.
-    """
-    return _guard(path, "torch file", _read_torch)
-
-
-def _guard(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
-    """Read a file; whatever is wrong with it becomes one clear message."""
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise DemoError(f"{path}: cannot be read: a folder, a pipe or a device.")
-    try:
-        with path.open("rb") as file:
-            if file.read(len(LFS)) == LFS:
-                raise DemoError(
-                    f"{path}: a Git-LFS pointer, not the file itself. Fetch it with "
-                    f"'git lfs pull' or download it anew."
-                )
-            file.seek(0)
-            return read(file)
-    except DemoError:
-        raise
-    except RefusedError as error:
-        raise DemoError(
-            f"{path}: E_PICKLE: it tried to load {error}, which is not data, so it was "
-            f"not read. Don't open it with anything else; get the file anew from where "
-            f"the dataset is published."
-        ) from error
-    except OSError as error:
-        raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
-    # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
-    except Exception as error:
-        told = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DemoError(
-            f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "
-            f"of another kind; unpack or download it anew."
-        ) from error
-
-
-def _unpickle(file: IO[bytes]) -> Any:
-    data = io.BytesIO(file.read())
-    check_pickle(data)
-    data.seek(0)
-    return to_value(_Unpickler(data, encoding="latin1").load())
-
-
-def to_value(tree: Any) -> Any:
-    """Plain values in place of the stand-ins of a pickle.
-
-    Raises:
-        ValueError: a part is not data, contains itself, or all is too large.
-    """
+    tree = _load(file)
     done: dict[int, Any] = {}
-    busy: set[int] = set()
     size = 0
 
     def plain(item: Any) -> Any:
         nonlocal size
-        if item is None or type(item) in (bool, int, float, complex, str):
+        if type(item) in ATOMS:
             return item
         key = id(item)  # stays unique: the tree holds every item until the end
-        if key in busy:
-            raise ValueError("a part that contains itself")
         if key not in done:
-            busy.add(key)
+            done[key] = BUSY
             made = done[key] = _convert(item, plain)
-            busy.discard(key)
             # one part of the file may be asked for in many forms, each a copy
-            size += getattr(made, "nbytes", 0) or 8 * _length(made)
+            length = len(made) if isinstance(made, (*CONTAINERS, dict)) else 0
+            size += getattr(made, "nbytes", 0) or 8 * length
             if size > MAX_BYTES:
                 raise ValueError("it becomes more than 4 GiB")
+        if done[key] is BUSY:
+            raise ValueError("a part that contains itself")
         return done[key]
 
     return plain(tree)
 
 
-def _length(made: Any) -> int:
-    return len(made) if isinstance(made, (list, tuple, dict, set, frozenset)) else 0
-
-
 def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
     if isinstance(item, StandIn):
-        return item.value(plain)
-    if type(item) in (list, tuple, set, frozenset):
+        args = tuple(a if isinstance(a, type) else plain(a) for a in item.args)
+        return type(item).make(args, plain(item.state))
+    if type(item) in CONTAINERS:
         return type(item)([plain(part) for part in item])
     if type(item) is dict:
         return {plain(key): plain(part) for key, part in item.items()}
-    if type(item) in (bytes, bytearray):
-        return item
     raise ValueError(f"a part that is not data ({type(item).__name__})")
-
-
-def _read_array(file: IO[bytes], size: int) -> Any:
-    """An array of .npy bytes; ``size`` is how many there are."""
-    version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(file)
-    elif version == (2, 0):
-        shape, by_columns, dtype = np.lib.format.read_array_header_2_0(file)
-    else:
-        raise ValueError(f"version {version} of the format is not known")
-    if dtype.kind == "O":
-        array = _unpickle(file)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
-            raise ValueError("an object array that holds something else")
-        return array.item() if array.ndim == 0 else array
-    count = math.prod(check_sizes(shape))
-    if dtype.hasobject or count * dtype.itemsize > size:
-        raise ValueError(f"shape {shape} of {dtype} does not fit to {size} bytes")
-    data = file.read(count * dtype.itemsize)
-    flat = np.frombuffer(bytearray(data), dtype, count)
-    return flat.reshape(shape, order="F" if by_columns else "C")
-
-
-def _read_npz(file: IO[bytes], only: Collection[str] | None = None) -> dict[str, Any]:
-    with zipfile.ZipFile(file) as archive:
-        members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
-        _check_size(members)
-        if not members:
-            raise ValueError("it holds no .npy entries")
-        entries = {}
-        for member in members:
-            name = member.filename.removesuffix(".npy")
-            if only is not None and name not in only:
-                continue
-            data = io.BytesIO(archive.read(member))
-            entries[name] = _read_array(data, member.file_size)
-        return entries
-
-
-def _check_size(members: list[zipfile.ZipInfo]) -> None:
-    size = sum(member.file_size for member in members)
-    if size > MAX_BYTES:
-        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
-
-
-def _read_torch(file: IO[bytes]) -> Any:
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            _check_size(archive.infolist())
-    file.seek(0)
-    return tensors.load_tensors(file)

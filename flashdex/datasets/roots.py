@@ -11,18 +11,14 @@ from flashdex.errors import DemoError, MeshError
 from flashdex.objects.meshes import load_mesh
 
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".7z")
-POINTER_START = b"version https://git-lfs"
-POINTER_SIZE = 200  # bytes; a pointer holds three short lines
 NUM_SHOWN = 8  # entries of a folder that a message shows
+SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+# names that exporters give the one mesh to look at in an object's own folder
+FAVOURITES = ("visual", "mesh")
 
 
 def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
     """Refuse a root that lacks the folders of a dataset.
-
-    Args:
-        root: what the user gave.
-        folders: all of them must be in the root.
-        dataset: for the message.
 
     Raises:
         DemoError: what was sought, what was found, and what is probably meant.
@@ -30,47 +26,11 @@ def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None
     missing = [folder for folder in folders if not (root / folder).is_dir()]
     if missing:
         raise DemoError(
-            f"{root}: E_ROOT: not the root of {dataset}. Sought the folders "
+            f"{root}: not the root of {dataset}. Sought the folders "
             f"{', '.join(folders)}; missing: {', '.join(missing)}; "
-            f"found: {_found(root)}.{_hint(root, folders)}"
+            f"found: {shown(root)}.{_hint(root, folders)}",
+            code="E_ROOT",
         )
-
-
-def refuse_pointer(file: Path) -> None:
-    """Refuse a Git-LFS pointer, which stands where the file should be.
-
-    Raises:
-        DemoError: the file is a pointer, or no file at all but a folder, a pipe, a
-            device or a broken link.
-        FileNotFoundError: there is nothing.
-    """
-    if not file.is_file() and (file.exists() or file.is_symlink()):
-        raise DemoError(
-            f"{file}: E_FILE: not a file but a folder, a pipe, a device or a broken "
-            f"link. Put the file itself there."
-        )
-    if file.stat().st_size >= POINTER_SIZE:
-        return
-    with file.open("rb") as stream:
-        start = stream.read(len(POINTER_START))
-    if start == POINTER_START:
-        raise DemoError(
-            f"{file}: E_ROOT: a Git-LFS pointer, not the file itself. "
-            f"Download the content: git lfs pull, or the dataset's own tool."
-        )
-
-
-def refuse_clone(files: Sequence[Path]) -> None:
-    """Refuse a clone whose content was not fetched: its first files are pointers.
-
-    Whatever else is wrong with a file costs its own recording only, when it is read.
-
-    Raises:
-        DemoError: one of the files is a pointer.
-    """
-    for file in files:
-        if file.is_file():
-            refuse_pointer(file)
 
 
 def relative(file: Path, root: Path) -> str:
@@ -78,7 +38,8 @@ def relative(file: Path, root: Path) -> str:
     return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
 
 
-def _found(root: Path) -> str:
+def shown(root: Path) -> str:
+    """What stands at a path, for a message: the first names of a folder."""
     if not root.exists():
         return "no such path"
     if not root.is_dir():
@@ -103,11 +64,6 @@ def _hint(root: Path, folders: Sequence[str]) -> str:
     return f" Unpack {', '.join(packed[:NUM_SHOWN])}." if packed else ""
 
 
-SUFFIXES = (".obj", ".ply", ".stl", ".glb")
-# names that exporters give the one mesh to look at in an object's own folder
-FAVOURITES = ("visual", "mesh")
-
-
 def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
     """Mesh file of an object, or None.
 
@@ -115,16 +71,13 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
     ``<name>/mesh.obj``, ``<name>/<name>.obj`` (or another suffix), then the only mesh
     in ``<name>/``.
 
-    Args:
-        name: id of the object; a plain name, not a path.
-        folders: where to look, in order.
-
     Raises:
         DemoError: the id is a path, or its folder holds several meshes and none of the
             names above.
     """
     if not name or name in (".", "..") or name != Path(name).name or "\\" in name:
-        raise DemoError(f"Object id '{name}' must be a plain name, not a path.")
+        text = f"Object id '{name}' must be a plain name, not a path."
+        raise DemoError(text, code="E_KEYS")
     for folder in folders:
         for suffix in SUFFIXES:
             if (file := folder / f"{name}{suffix}").is_file():
@@ -135,16 +88,7 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
 
 
 def find_mesh(name: str, folders: Iterable[Path], *, where: Path | str) -> Path:
-    """As ``seek_mesh``, but a missing mesh is an error.
-
-    Args:
-        name: id of the object.
-        folders: where to look, in order.
-        where: the recording, for the message.
-
-    Raises:
-        DemoError: names the folders that were searched.
-    """
+    """As ``seek_mesh``; where there is none, a ``DemoError`` names the folders."""
     folders = list(folders)
     found = seek_mesh(name, folders)
     if found is None:
@@ -152,7 +96,8 @@ def find_mesh(name: str, folders: Iterable[Path], *, where: Path | str) -> Path:
         raise DemoError(
             f"{where}: no mesh of object '{name}'. Sought {name}.obj (.ply, .stl, "
             f".glb) and {name}/*.obj in: {places}. Give the folder of the meshes with "
-            f"--models."
+            f"--models.",
+            code="E_FILE",
         )
     return found
 
@@ -174,9 +119,17 @@ def mesh_in(folder: Path) -> Path | None:
         names = ", ".join(f.name for f in files[:4])
         raise DemoError(
             f"{folder}: {len(files)} meshes ({names}, ...). Expected one, or one "
-            f"called visual.obj."
+            f"called visual.obj.",
+            code="E_FILE",
         )
     return files[0] if files else None
+
+
+def require_mesh(file: Path, hint: str) -> Path:
+    """Refuse a mesh that is missing; the hint says what to do, with --models."""
+    if not file.is_file():
+        raise DemoError(f"{file}: mesh not found. {hint} with --models.", code="E_FILE")
+    return file
 
 
 def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
@@ -190,4 +143,4 @@ def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
     try:
         return load_mesh(file).apply_scale(scale)
     except MeshError as error:
-        raise DemoError(str(error)) from error
+        raise DemoError(error.text, code="E_MESH") from error

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from flashdex.datasets.demo import HumanDemo
+if TYPE_CHECKING:  # names of sources are asked for where nothing is read
+    from flashdex.datasets.demo import HumanDemo
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +30,12 @@ class SourceOptions:
     splits: Path | None = None
     seed: int = 0
     limit: int | None = None
+
+    def folder(self, name: str) -> Path:
+        """An option that the source needs (``Source.needs``), as it was given."""
+        value = getattr(self, name)
+        assert value is not None, name
+        return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +64,17 @@ class Source:
     """A reader of one dataset layout.
 
     Attributes:
+        name: how recipes and the command line call it.
         list: names the recordings of a root, in a fixed order.
         about: one line: what it reads.
         licence: one line: terms of the recordings, shown before they are used.
         needs: which options must be given (``path``, ``mano``, ...).
+        made_up: its path is a word, not a place on the disk.
     """
 
+    name: str
     list: Callable[[SourceOptions], list[Recording]]
     about: str
     licence: str = ""
-    needs: tuple[str, ...] = field(default=("path",))
+    needs: tuple[str, ...] = ("path",)
+    made_up: bool = False

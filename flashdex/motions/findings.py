@@ -47,8 +47,7 @@ def of_error(error: Exception) -> Finding:
     """The rejection that an error about a recording comes to."""
     if isinstance(error, DemoError | MeshError):
         usual = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
-        code, text = getattr(error, "code", None), getattr(error, "text", str(error))
-        return reject(code or usual, text)
+        return reject(error.code or usual, error.text)
     if isinstance(error, OSError):  # a name too long, a folder that may not be entered
         return reject("E_FILE", f"cannot be read: {error}")
     return reject("E_READ", f"unforeseen {type(error).__name__}: {error}")

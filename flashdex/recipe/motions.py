@@ -6,23 +6,15 @@ These dataclasses are the one place of defaults. Metres, radians, seconds, kilog
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+from flashdex.datasets import source_names
 from flashdex.system.fields import number
 
-SourceName = Literal[
-    "procedural",
-    "keypoints",
-    "myodm",
-    "taco",
-    "oakink2",
-    "hot3d",
-    "arctic",
-    "grab",
-    "spider",
-    "fdr",
-]
-"""Readers of recordings; `flashdex.datasets.SOURCES` has the same names."""
+if TYPE_CHECKING:  # the readers that there are; a checker of types cannot know them
+    SourceName = str
+else:
+    SourceName = Literal[tuple(source_names())]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,16 +16,16 @@ from layouts import arctic, fdr, grab, hot3d, oakink2, spider, taco
 from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
-from flashdex.datasets.arctic import ARCTIC
+from flashdex.datasets.arctic import SOURCE as ARCTIC
 from flashdex.datasets.demo import UP_ROTATION, DemoObject, HumanDemo
-from flashdex.datasets.fdr.reader import FDR
-from flashdex.datasets.grab import GRAB
-from flashdex.datasets.hot3d.reader import HOT3D
-from flashdex.datasets.keypoints import KEYPOINTS
-from flashdex.datasets.oakink2.reader import OAKINK2
+from flashdex.datasets.fdr.reader import SOURCE as FDR
+from flashdex.datasets.grab import SOURCE as GRAB
+from flashdex.datasets.hot3d.reader import SOURCE as HOT3D
+from flashdex.datasets.keypoints import SOURCE as KEYPOINTS
+from flashdex.datasets.oakink2.reader import SOURCE as OAKINK2
 from flashdex.datasets.source import Source, SourceOptions
-from flashdex.datasets.spider.reader import SPIDER
-from flashdex.datasets.taco.reader import TACO
+from flashdex.datasets.spider.reader import SOURCE as SPIDER
+from flashdex.datasets.taco.reader import SOURCE as TACO
 from flashdex.datasets.tracks import palm_frame
 
 SECONDS = 2.0

@@ -13,7 +13,7 @@ from layouts.scene import make_scene
 from layouts.taco import matrices
 
 from flashdex.datasets.oakink2.annotation import parse_intervals
-from flashdex.datasets.oakink2.reader import OAKINK2
+from flashdex.datasets.oakink2.reader import SOURCE as OAKINK2
 from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
@@ -370,7 +370,7 @@ def test_intervals(key, intervals):
     ],
 )
 def test_wrong_intervals(key):
-    with pytest.raises(DemoError, match="E_KEYS: key") as error:
+    with pytest.raises(DemoError, match=r"^E_KEYS: x.json: key") as error:
         parse_intervals(key, where="x.json")
     assert len(str(error.value)) < 400
 

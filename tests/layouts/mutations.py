@@ -376,7 +376,7 @@ def _mano():
 
 def _model_changer(change):
     def spoil(file, rng):
-        from flashdex.datasets.pickles import load_pickle  # stand-ins for chumpy
+        from flashdex.datasets.files import load_pickle  # stand-ins for chumpy
 
         parts = load_pickle(file)
         parts["J_regressor"] = parts["J_regressor"].toarray()

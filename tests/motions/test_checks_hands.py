@@ -96,8 +96,9 @@ def test_entries_of_another_kind_are_named():
     assert word(np.array("box"), what="x") == "box"
     np.testing.assert_array_equal(numbers([[1, 2]], what="x"), [[1.0, 2.0]])
     for value in ("thirty", 1j, None, [[1], [2, 3]], {"a": 1}, b"1", [2**70]):
-        with pytest.raises(DemoError, match="fps: E_KEYS: not numbers"):
+        with pytest.raises(DemoError, match=r"^E_KEYS: fps: not numbers") as caught:
             numbers(value, what="fps")
+        assert caught.value.code == "E_KEYS"
     with pytest.raises(DemoError, match="expected one number"):
         number([1, 2], what="fps")
     with pytest.raises(DemoError, match="expected one text"):

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from flashdex.datasets import SOURCES, list_recordings
+from flashdex.datasets import list_recordings, register
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
@@ -185,8 +185,9 @@ def test_copies_are_reported_and_left_out(tmp_path, monkeypatch, settings):
         for n in names[:2]
     ]
     listed += list_recordings("procedural", SourceOptions(path="pick_box_right"))
-    source = Source(list=lambda options: listed, about="test", needs=())
-    monkeypatch.setitem(SOURCES, "copies", source)
+    monkeypatch.setattr("flashdex.datasets.REGISTERED", {})
+    made = {"list": lambda options: listed, "about": "test", "needs": ()}
+    register(Source(name="copies", **made))
     order = Order("copies", SourceOptions(), settings)
     library = run_order(order, tmp_path / "library")
     report = (library.path / "report.csv").read_text()
@@ -198,8 +199,9 @@ def test_inputs_hash_follows_content_not_place(tmp_path, monkeypatch, settings):
     file = tmp_path / "a"
     file.write_bytes(b"one")
     listed = [Recording(name="a", read=never, files=(file,))]
-    source = Source(list=lambda options: listed, about="test", needs=())
-    monkeypatch.setitem(SOURCES, "hashed", source)
+    monkeypatch.setattr("flashdex.datasets.REGISTERED", {})
+    made = {"list": lambda options: listed, "about": "test", "needs": ()}
+    register(Source(name="hashed", **made))
     order = Order("hashed", SourceOptions(), settings)
     first = hash_inputs(order)
     assert hash_inputs(replace(order, settings=replace(settings, speed=0.5))) != first

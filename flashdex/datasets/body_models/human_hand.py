@@ -93,21 +93,13 @@ def _chain(base: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 @dataclass
 class GraspTarget:
-    """Where the tips of a right hand should go, in the object frame.
+    """Where the tips of a right hand should go, in the object frame."""
 
-    Args:
-        tips: wanted fingertips, m, (5, 3); NaN rows are free.
-        palm: wished palm orientation (columns are the palm axes), (3, 3).
-        surface: points of the object's surface, m, (S, 3).
-        normals: outward normals of them, (S, 3).
-        floor: height of the table in the object frame, m.
-    """
-
-    tips: np.ndarray
-    palm: np.ndarray
-    surface: np.ndarray
-    normals: np.ndarray
-    floor: float
+    tips: np.ndarray  # wanted fingertips, m, (5, 3); NaN rows are free
+    palm: np.ndarray  # wished palm orientation (columns are the palm axes), (3, 3)
+    surface: np.ndarray  # points of the object's surface, m, (S, 3)
+    normals: np.ndarray  # outward normals of them, (S, 3)
+    floor: float  # height of the table in the object frame, m
 
 
 @dataclass

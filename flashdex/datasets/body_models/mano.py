@@ -7,6 +7,7 @@ quaternions share one path. Only what the keypoints need is skinned.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,158 +16,30 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.pickles import load_npz, load_pickle
+from flashdex.datasets.fields import same_length
+from flashdex.datasets.files import load_npz, load_pickle
+from flashdex.datasets.tracks import missing_frames, rotation
 from flashdex.errors import DemoError
-from flashdex.keys import SIDES, Side
+from flashdex.keys import Side
 
 # below the folder that the user names, in this order
 PLACES = (".", "models", "mano", "mano_v1_2/models")
 NUM_VERTICES, NUM_JOINTS, NUM_BETAS = 778, 16, 10
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
-SHAPES = {
-    "v_template": (NUM_VERTICES, 3),
-    "shapedirs": (NUM_VERTICES, 3, NUM_BETAS),
-    "posedirs": (NUM_VERTICES, 3, 9 * (NUM_JOINTS - 1)),
-    "J_regressor": (NUM_JOINTS, NUM_VERTICES),
-    "weights": (NUM_VERTICES, NUM_JOINTS),
-    "kintree_table": (2, NUM_JOINTS),
-    "hands_mean": (45,),
-    "hands_components": (45, 45),
+KINTREE = "kintree_table"
+# parts of ``ManoArrays``: their key and shape in a file
+PARTS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "template": ("v_template", (NUM_VERTICES, 3)),
+    "shape_dirs": ("shapedirs", (NUM_VERTICES, 3, NUM_BETAS)),
+    "pose_dirs": ("posedirs", (NUM_VERTICES, 3, 9 * (NUM_JOINTS - 1))),
+    "regressor": ("J_regressor", (NUM_JOINTS, NUM_VERTICES)),
+    "weights": ("weights", (NUM_VERTICES, NUM_JOINTS)),
+    "mean": ("hands_mean", (45,)),
+    "components": ("hands_components", (45, 45)),
 }
-
-
-@dataclass(frozen=True)
-class ManoArrays:
-    """What a MANO file holds; float64, metres.
-
-    Args:
-        template: vertices of the mean shape, flat open hand, (778, 3).
-        shape_dirs: change of the vertices per shape coefficient, (778, 3, 10).
-        pose_dirs: change of the vertices per element of R - 1, (778, 3, 135).
-        regressor: joints from vertices, (16, 778).
-        weights: of the vertices on the joints, (778, 16).
-        mean: mean finger pose, axis-angle, (45,).
-        components: principal components of finger poses, in rows, (45, 45).
-    """
-
-    template: np.ndarray
-    shape_dirs: np.ndarray
-    pose_dirs: np.ndarray
-    regressor: np.ndarray
-    weights: np.ndarray
-    mean: np.ndarray
-    components: np.ndarray
-
-
-def mano_pair(folder: Path) -> tuple[Path, Path]:
-    """The model files of both hands, left first.
-
-    Raises:
-        DemoError: one of them is missing.
-    """
-    left, right = (mano_file(folder, side) for side in SIDES)
-    return left, right
-
-
-def mano_file(folder: Path, side: Side) -> Path:
-    """The model file of one hand.
-
-    Args:
-        folder: that the user names; ``models/``, ``mano/`` and ``mano_v1_2/models/``
-            below it are searched as well.
-        side: of the hand.
-
-    Raises:
-        DemoError: there is none; the message names every place.
-    """
-    names = [f"MANO_{side.upper()}{ending}" for ending in (".pkl", ".npz")]
-    for place in PLACES:
-        for name in names:
-            if (folder / place / name).is_file():
-                return folder / place / name
-    places = ", ".join(str(folder / place) for place in PLACES)
-    raise DemoError(
-        f"E_MANO: no {names[0]} (or .npz) in {places}. Register at mano.is.tue.mpg.de, "
-        f"unpack mano_v1_2.zip, and give its folder with --mano."
-    )
-
-
-def read_mano(file: Path, side: Side) -> ManoArrays:
-    """The checked content of a model file.
-
-    Raises:
-        DemoError: the file cannot be read, lacks something, has another shape, or is
-            of the other hand.
-    """
-    data = load_npz(file) if file.suffix == ".npz" else load_pickle(file)
-    if not isinstance(data, dict):
-        raise DemoError(f"E_MANO: {file} holds a {type(data).__name__}, not a model.")
-    missing = sorted(set(SHAPES) - set(data))
-    if missing:
-        raise DemoError(
-            f"E_MANO: {file} lacks {', '.join(missing)}. Expected a model of "
-            f"mano_v1_2.zip; found {', '.join(sorted(map(str, data))[:12])}."
-        )
-    parts = {key: _array(file, key, data[key]) for key in SHAPES}
-    _check_tree(file, parts["kintree_table"])
-    arrays = ManoArrays(
-        template=parts["v_template"],
-        shape_dirs=parts["shapedirs"],
-        pose_dirs=parts["posedirs"],
-        regressor=parts["J_regressor"],
-        weights=parts["weights"],
-        mean=parts["hands_mean"],
-        components=parts["hands_components"],
-    )
-    _check_side(file, side, arrays)
-    return arrays
-
-
-def _array(file: Path, key: str, value: Any) -> np.ndarray:
-    """One part as a dense float64 array of the expected shape."""
-    shape = tuple(getattr(value, "shape", ()))
-    if shape != SHAPES[key]:
-        raise DemoError(
-            f"E_MANO: {file}: {key} has shape {shape}, expected {SHAPES[key]}. "
-            f"MANO_LEFT and MANO_RIGHT of mano_v1_2.zip are read, no other model."
-        )
-    dense = value.toarray() if hasattr(value, "toarray") else value
-    try:
-        array = np.array(dense, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DemoError(f"E_MANO: {file}: {key} does not hold numbers.") from error
-    if not np.isfinite(array).all():
-        raise DemoError(f"E_MANO: {file}: {key} holds NaN or infinity.")
-    array.setflags(write=False)  # one model serves all recordings of a worker
-    return array
-
-
-def _check_tree(file: Path, table: np.ndarray) -> None:
-    # the root's parent is stored as an unsigned -1
-    if tuple(table[0, 1:].astype(int)) != PARENTS[1:]:
-        raise DemoError(
-            f"E_MANO: {file}: kintree_table is not the tree of MANO: parents "
-            f"{table[0, 1:].astype(int).tolist()}, expected {list(PARENTS[1:])}."
-        )
-
-
-def _check_side(file: Path, side: Side, arrays: ManoArrays) -> None:
-    """The rest wrist of a right hand has positive x, of a left hand negative x."""
-    x = float(arrays.regressor[0] @ arrays.template[:, 0])
-    if (x > 0) != (side == "right"):
-        other = "left" if side == "right" else "right"
-        raise DemoError(
-            f"E_MANO: {file} is a {other} hand (rest wrist at x = {x:.3f} m) under the "
-            f"name of a {side} one. The two files are swapped; unpack them anew."
-        )
-
-
-__all__ = ["ManoModel", "load_mano", "mano_file"]
-
 # "joint": the rest wrist joint is added to the translation (smplx); "wrist": the
 # translation is where the wrist is (manotorch with center_idx = 0)
 Convention = Literal["joint", "wrist"]
-
 # vertices at the fingertips, thumb to pinky: those of manopth, for every dataset
 TIP_VERTICES: dict[Side, tuple[int, ...]] = {
     "left": (745, 317, 445, 556, 673),
@@ -180,28 +53,103 @@ SAME_SHAPE_DIRS = 1.0
 
 
 @dataclass(frozen=True)
+class ManoArrays:
+    """What a MANO file holds; float64, metres."""
+
+    template: np.ndarray  # vertices of the mean shape, flat open hand, (778, 3)
+    shape_dirs: np.ndarray  # their change per shape coefficient, (778, 3, 10)
+    pose_dirs: np.ndarray  # their change per element of R - 1, (778, 3, 135)
+    regressor: np.ndarray  # joints from vertices, (16, 778)
+    weights: np.ndarray  # of the vertices on the joints, (778, 16)
+    mean: np.ndarray  # mean finger pose, axis-angle, (45,)
+    components: np.ndarray  # principal components of finger poses, in rows, (45, 45)
+
+
+def mano_pair(folder: Path) -> tuple[Path, Path]:
+    """The model files of both hands, left first."""
+    return mano_file(folder, "left"), mano_file(folder, "right")
+
+
+def mano_file(folder: Path, side: Side) -> Path:
+    """The model file of one hand, in a folder or in ``PLACES`` below it."""
+    names = [f"MANO_{side.upper()}{ending}" for ending in (".pkl", ".npz")]
+    for place in PLACES:
+        for name in names:
+            if (folder / place / name).is_file():
+                return folder / place / name
+    places = ", ".join(str(folder / place) for place in PLACES)
+    raise DemoError(
+        f"no {names[0]} (or .npz) in {places}. Register at mano.is.tue.mpg.de, "
+        f"unpack mano_v1_2.zip, and give its folder with --mano.",
+        code="E_MANO",
+    )
+
+
+def read_mano(file: Path, side: Side) -> ManoArrays:
+    """The checked content of a model file."""
+    data = load_npz(file) if file.suffix == ".npz" else load_pickle(file)
+    if not isinstance(data, dict):
+        raise _wrong(file, f"it holds a {type(data).__name__}, not a model.")
+    missing = sorted({KINTREE, *(key for key, _ in PARTS.values())} - set(data))
+    if missing:
+        raise _wrong(
+            file,
+            f"it lacks {', '.join(missing)}. Expected a model of mano_v1_2.zip; found "
+            f"{', '.join(sorted(map(str, data))[:12])}.",
+        )
+    parents = _array(file, KINTREE, data[KINTREE], (2, NUM_JOINTS))[0, 1:].astype(int)
+    if tuple(parents) != PARENTS[1:]:  # the root's is stored as an unsigned -1
+        raise _wrong(
+            file,
+            f"kintree_table is not the tree of MANO: parents {parents.tolist()}, "
+            f"expected {list(PARENTS[1:])}.",
+        )
+    arrays = ManoArrays(
+        **{n: _array(file, key, data[key], shape) for n, (key, shape) in PARTS.items()}
+    )
+    # the rest wrist of a right hand has positive x, of a left hand negative x
+    x = float(arrays.regressor[0] @ arrays.template[:, 0])
+    if (x > 0) != (side == "right"):
+        other = "left" if side == "right" else "right"
+        raise _wrong(
+            file,
+            f"it is a {other} hand (rest wrist at x = {x:.3f} m) under the name of a "
+            f"{side} one. The two files are swapped; unpack them anew.",
+        )
+    return arrays
+
+
+def _array(file: Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """One part as a dense float64 array of the expected shape."""
+    found = tuple(getattr(value, "shape", ()))
+    if found != shape:
+        raise _wrong(
+            file,
+            f"{key} has shape {found}, expected {shape}. MANO_LEFT and MANO_RIGHT of "
+            f"mano_v1_2.zip are read, no other model.",
+        )
+    try:
+        dense = value.toarray() if hasattr(value, "toarray") else value
+        array = np.array(dense, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise _wrong(file, f"{key} does not hold numbers.") from error
+    if not np.isfinite(array).all():
+        raise _wrong(file, f"{key} holds NaN or infinity.")
+    array.setflags(write=False)  # one model serves all recordings of a worker
+    return array
+
+
+def _wrong(file: Path, text: str) -> DemoError:
+    return DemoError(f"{file}: {text}", code="E_MANO")
+
+
+@dataclass(frozen=True)
 class ManoModel:
-    """One hand of MANO.
+    """One hand of MANO."""
 
-    Args:
-        side: of the hand.
-        arrays: of its file.
-        left_shape_fixed: whether the sign error of the left shape was corrected.
-
-    Example:
-        >>> model = load_mano(Path("~/mano").expanduser(), "right")  # doctest: +SKIP
-        >>> flat = np.zeros((1, 48))
-        >>> model.keypoints(
-        ...     rotations_from_axis_angle(flat),
-        ...     np.zeros(10),
-        ...     np.zeros((1, 3)),
-        ...     convention="wrist",
-        ... ).shape  # doctest: +SKIP
-        (1, 21, 3)
-    """
-
-    side: Side
-    arrays: ManoArrays
+    side: Side  # of the hand
+    arrays: ManoArrays  # of its file
+    # whether the sign error of the left shape was corrected
     left_shape_fixed: bool = False
 
     def keypoints(
@@ -225,53 +173,44 @@ class ManoModel:
 
         Returns:
             m, world, (T, 21, 3); NaN in every frame with a NaN.
-
-        Raises:
-            DemoError: an array has another shape.
         """
-        tips = list(TIP_VERTICES[self.side])
-        joints, vertices = self._pose(
-            rotations, betas, translation, convention, template, tips
-        )
-        return np.concatenate([joints, vertices], axis=1)[:, [0, *FINGER_ROWS]]
+        shaped, tips = self.shape(betas, template), list(TIP_VERTICES[self.side])
+        points = self.pose(rotations, shaped, translation, tips, convention=convention)
+        return points[:, [0, *FINGER_ROWS]]
 
-    def vertices(
+    def keypoints_of(
         self,
-        rotations: np.ndarray,
-        betas: np.ndarray | None,
+        wrist: np.ndarray,
+        fingers: np.ndarray,
         translation: np.ndarray,
         *,
+        betas: np.ndarray | None,
         convention: Convention,
+        where: str,
         template: np.ndarray | None = None,
     ) -> np.ndarray:
-        """The whole skin, m, (T, 778, 3); arguments as in ``keypoints``."""
-        rows = list(range(NUM_VERTICES))
-        return self._pose(rotations, betas, translation, convention, template, rows)[1]
+        """As ``keypoints``, of axis-angle poses: wrist (T, 3), fingers (T, 45), rad."""
+        counts = {"turn": len(wrist), "fingers": len(fingers)}
+        same_length(counts | {"transl": len(translation)}, where=where)
+        turns = rotations_from_axis_angle(np.concatenate([wrist, fingers], axis=1))
+        return self.keypoints(
+            turns, betas, translation, convention=convention, template=template
+        )
 
     def rest_wrist(
         self, betas: np.ndarray | None = None, template: np.ndarray | None = None
     ) -> np.ndarray:
         """Where the wrist joint is at rest, m, (3,): what "joint" adds."""
-        return self.arrays.regressor[0] @ self._shape(betas, template)
+        return self.arrays.regressor[0] @ self.shape(betas, template)
 
     def finger_pose(self, coefficients: np.ndarray, *, flat: bool) -> np.ndarray:
-        """Axis-angle of the fingers from principal components.
+        """Axis-angle of the fingers, rad, (T, 45), from principal components (T, n).
 
-        Args:
-            coefficients: of the first n components, (T, n).
-            flat: zero coefficients are the flat hand, not the mean pose.
-
-        Returns:
-            rad, (T, 45).
-
-        Raises:
-            DemoError: there are more than 45 coefficients, or not one row a frame.
+        With ``flat`` zero coefficients are the flat hand, else the mean pose.
         """
         if coefficients.ndim != 2 or coefficients.shape[1] > 45:
-            raise DemoError(
-                f"MANO coefficients have shape {coefficients.shape}, expected (T, n) "
-                f"with n <= 45."
-            )
+            shape = coefficients.shape
+            raise DemoError(f"MANO coefficients {shape}, expected (T, n), n <= 45.")
         pose = coefficients @ self.arrays.components[: coefficients.shape[1]]
         return pose if flat else self.add_mean(pose)
 
@@ -279,10 +218,10 @@ class ManoModel:
         """Axis-angle of the fingers (T, 45) from one relative to the mean pose."""
         return pose + self.arrays.mean
 
-    def _shape(
-        self, betas: np.ndarray | None, template: np.ndarray | None
+    def shape(
+        self, betas: np.ndarray | None = None, template: np.ndarray | None = None
     ) -> np.ndarray:
-        """Vertices at rest, (778, 3)."""
+        """Vertices at rest, m, (778, 3)."""
         base = self.arrays.template if template is None else np.asarray(template)
         _check_shape("template", base, (NUM_VERTICES, 3))
         if betas is None:
@@ -291,43 +230,28 @@ class ManoModel:
         _check_shape("betas", betas, (NUM_BETAS,))
         return base + self.arrays.shape_dirs @ betas
 
-    def _pose(
+    def pose(
         self,
         rotations: np.ndarray,
-        betas: np.ndarray | None,
+        shaped: np.ndarray,
         translation: np.ndarray,
-        convention: Convention,
-        template: np.ndarray | None,
         rows: list[int],
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (T, 16, 3) and vertices ``rows`` (T, len(rows), 3) in the world."""
+        *,
+        convention: Convention,
+    ) -> np.ndarray:
+        """The 16 joints, then the vertices ``rows``, m, world, (T, 16 + rows, 3).
+
+        ``shaped`` are the vertices at rest, m, (778, 3); see ``keypoints``.
+        """
         frames = len(rotations)
         _check_shape("rotations", rotations, (frames, NUM_JOINTS, 3, 3))
         _check_shape("translation", translation, (frames, 3))
-        shaped = self._shape(betas, template)
         rest = self.arrays.regressor @ shaped
-        seen = np.isfinite(rotations.reshape(frames, -1)).all(axis=1)
-        seen &= np.isfinite(translation).all(axis=1)
+        seen = ~missing_frames(rotations, translation)
         turns, joints = _chain(rotations[seen], rest)
-        skin = self._skin(rotations[seen], turns, joints, shaped, rest, rows)
-        shift = translation[seen]
-        if convention == "wrist":
-            shift = shift - joints[:, 0]
-        out = np.full((frames, NUM_JOINTS + len(rows), 3), np.nan)
-        out[seen] = np.concatenate([joints, skin], axis=1) + shift[:, None]
-        return out[:, :NUM_JOINTS], out[:, NUM_JOINTS:]
-
-    def _skin(
-        self,
-        rotations: np.ndarray,
-        turns: np.ndarray,
-        joints: np.ndarray,
-        shaped: np.ndarray,
-        rest: np.ndarray,
-        rows: list[int],
-    ) -> np.ndarray:
-        """Vertices ``rows`` carried by the joints, before the translation."""
-        feature = (rotations[:, 1:] - np.eye(3)).reshape(-1, 9 * (NUM_JOINTS - 1))
+        # what the pose does to the skin, before the joints carry it
+        feature = rotations[seen, 1:] - np.eye(3)
+        feature = feature.reshape(-1, 9 * (NUM_JOINTS - 1))
         bent = self.arrays.pose_dirs[rows].reshape(-1, feature.shape[1])
         skin = shaped[rows] + (feature @ bent.T).reshape(len(feature), len(rows), 3)
         vertices = np.zeros_like(skin)
@@ -335,7 +259,12 @@ class ManoModel:
             moved = (skin - rest[joint]) @ turns[:, joint].swapaxes(1, 2)
             moved += joints[:, joint, None]
             vertices += self.arrays.weights[rows, joint, None] * moved
-        return vertices
+        shift = translation[seen]
+        if convention == "wrist":
+            shift = shift - joints[:, 0]
+        out = np.full((frames, NUM_JOINTS + len(rows), 3), np.nan)
+        out[seen] = np.concatenate([joints, vertices], axis=1) + shift[:, None]
+        return out
 
 
 def _chain(rotations: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -354,14 +283,8 @@ def _chain(rotations: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndar
 def load_mano(folder: Path, side: Side, *, fix_left_shape: bool = False) -> ManoModel:
     """The model of one hand; kept for the next call.
 
-    Args:
-        folder: with the model files, or one above them (see ``mano_file``).
-        side: of the hand.
-        fix_left_shape: correct the sign error of the released left hand's shape, if
-            this file has it. Only for datasets that were fitted that way.
-
-    Raises:
-        DemoError: E_MANO: a file is missing, damaged, or not this hand.
+    ``fix_left_shape`` corrects the sign error of the released left hand's shape, if
+    this file has it; only for datasets that were fitted that way.
     """
     arrays = read_mano(mano_file(folder, side), side)
     if not fix_left_shape or side == "right":
@@ -377,11 +300,7 @@ def load_mano(folder: Path, side: Side, *, fix_left_shape: bool = False) -> Mano
 def rotations_from_axis_angle(pose: np.ndarray) -> np.ndarray:
     """Rotation matrices (T, 16, 3, 3) of axis-angle poses (T, 48), rad; NaN to NaN."""
     vectors = np.asarray(pose, dtype=np.float64).reshape(len(pose), NUM_JOINTS, 3)
-    seen = np.isfinite(vectors).all(axis=(1, 2))
-    out = np.full((len(pose), NUM_JOINTS, 3, 3), np.nan)
-    turns = Rotation.from_rotvec(vectors[seen].reshape(-1, 3)).as_matrix()
-    out[seen] = turns.reshape(-1, NUM_JOINTS, 3, 3)
-    return out
+    return _matrices(vectors, Rotation.from_rotvec, ~missing_frames(vectors))
 
 
 def rotations_from_quats(quats: np.ndarray) -> np.ndarray:
@@ -393,9 +312,14 @@ def rotations_from_quats(quats: np.ndarray) -> np.ndarray:
     _check_shape("quaternions", quats, (len(quats), NUM_JOINTS, 4))
     norms = np.linalg.norm(quats, axis=-1)
     seen = (np.isfinite(norms) & (norms > 1e-6)).all(axis=1)
-    out = np.full((len(quats), NUM_JOINTS, 3, 3), np.nan)
-    flat = quats[seen].reshape(-1, 4)
-    turns = Rotation.from_quat(flat, scalar_first=True).as_matrix()
+    return _matrices(quats, rotation, seen)
+
+
+def _matrices(
+    given: np.ndarray, make: Callable[[np.ndarray], Rotation], seen: np.ndarray
+) -> np.ndarray:
+    out = np.full((len(given), NUM_JOINTS, 3, 3), np.nan)
+    turns = make(given[seen].reshape(-1, given.shape[-1])).as_matrix()
     out[seen] = turns.reshape(-1, NUM_JOINTS, 3, 3)
     return out
 

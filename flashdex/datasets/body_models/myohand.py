@@ -41,9 +41,6 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
 
     Returns:
         m, world, (T, 21, 3).
-
-    Raises:
-        DemoError: the file is not the hand's tree.
     """
     model, owners = _model(tree)
     data = mujoco.MjData(model)

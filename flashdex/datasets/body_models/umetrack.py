@@ -15,15 +15,15 @@ the thumb, about 5 cm from the wrist and 3 cm from the MCP.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.tracks import rotation
+from flashdex.datasets.fields import numbers, part, require
+from flashdex.datasets.files import read_json
+from flashdex.datasets.tracks import missing_frames, rotation
 from flashdex.errors import DemoError
 from flashdex.keys import Side
 
@@ -48,21 +48,14 @@ KEYS = (
 
 @dataclass(frozen=True)
 class UmeTrackHand:
-    """A hand of one person, at rest.
+    """A hand of one person, at rest."""
 
-    Args:
-        axes: of the hinges, unit, (J, 3).
-        origins: of the hinges, m, (J, 3).
-        parents: hinge before each, -1 at the wrist, (J,); always an earlier one.
-        points: keypoints in the 21-order, m, (21, 3).
-        movers: the hinge that moves each keypoint, -1 for the wrist, (21,).
-    """
-
-    axes: np.ndarray
-    origins: np.ndarray
+    axes: np.ndarray  # of the hinges, unit, (J, 3)
+    origins: np.ndarray  # of the hinges, m, (J, 3)
+    # hinge before each, -1 at the wrist, (J,); always an earlier one
     parents: np.ndarray
-    points: np.ndarray
-    movers: np.ndarray
+    points: np.ndarray  # keypoints in the 21-order, m, (21, 3)
+    movers: np.ndarray  # the hinge that moves each keypoint, -1 for the wrist, (21,)
 
     def keypoints(
         self, angles: np.ndarray, wrist: np.ndarray, side: Side
@@ -77,7 +70,7 @@ class UmeTrackHand:
         Returns:
             Keypoints in the 21-order, m, world, (T, 21, 3); NaN where an input is.
         """
-        seen = np.isfinite(angles).all(axis=1) & np.isfinite(wrist).all(axis=1)
+        seen = ~missing_frames(angles, wrist)
         out = np.full((len(angles), len(self.points), 3), np.nan)
         if seen.any():
             turn = rotation(wrist[seen, 3:]).as_matrix()
@@ -113,16 +106,19 @@ class UmeTrackHand:
 
 
 def load_umetrack(file: Path) -> UmeTrackHand:
-    """Read a hand profile.
-
-    Args:
-        file: ``umetrack_hand_user_profile.json``.
-
-    Raises:
-        DemoError: the file is missing, no JSON, or of another layout.
-    """
-    model = _read_model(file)
-    arrays = {key: _array(model, key, file) for key in KEYS}
+    """Read a hand profile."""
+    if not file.exists():
+        raise DemoError(
+            f"{file}: not found. It holds the hand's bones, which are needed without "
+            f"MANO. Download the hand data of the sequence, or give --mano."
+        )
+    fault = "not a hand profile, JSON with 'hand_model'"
+    model = part(read_json(file, fault), "hand_model", where=f"{file}: {fault}")
+    where = f"{file}: hand_model"
+    require(model, *KEYS, where=where)
+    arrays = {key: numbers(model[key], what=f"{where}.{key}") for key in KEYS}
+    if wrong := [key for key in KEYS if not np.isfinite(arrays[key]).all()]:
+        raise DemoError(f"{where}: {', '.join(wrong)} hold NaN or infinity.")
     joints = arrays["joint_parent"].size
     shapes = dict.fromkeys(KEYS[:2], (joints, 3))
     shapes |= dict.fromkeys(KEYS[4:], (NUM_LANDMARKS, 3))
@@ -134,37 +130,6 @@ def load_umetrack(file: Path) -> UmeTrackHand:
                 f"{shape}. Download the hand data of the sequence again."
             )
     return _build(arrays, file)
-
-
-def _read_model(file: Path) -> dict[str, Any]:
-    if file.exists() and not file.is_file():
-        raise DemoError(f"{file}: not a file but a folder, pipe or device.")
-    try:
-        model = json.loads(file.read_text(encoding="utf-8"))["hand_model"]
-    except FileNotFoundError as error:
-        raise DemoError(
-            f"{file}: not found. It holds the hand's bones, which are needed without "
-            f"MANO. Download the hand data of the sequence, or give --mano."
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DemoError(
-            f"{file}: not a hand profile ({error!r}). Expected JSON with 'hand_model'."
-        ) from error
-    if not isinstance(model, dict):
-        raise DemoError(f"{file}: 'hand_model' must hold named arrays.")
-    return model
-
-
-def _array(model: dict[str, Any], key: str, file: Path) -> np.ndarray:
-    try:
-        array = np.asarray(model[key], dtype=np.float64)
-    except (KeyError, ValueError, TypeError) as error:
-        raise DemoError(
-            f"{file}: hand_model.{key} is missing or not numeric: {error!r}."
-        ) from error
-    if not np.isfinite(array).all():
-        raise DemoError(f"{file}: hand_model.{key} holds NaN or infinity.")
-    return array
 
 
 def _build(arrays: dict[str, np.ndarray], file: Path) -> UmeTrackHand:

@@ -15,7 +15,7 @@ from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fdr.scene import context_objects, support_height
 from flashdex.datasets.fields import number, numbers, poses_from_matrices, word
 from flashdex.datasets.roots import find_mesh, scaled_mesh, seek_mesh
-from flashdex.datasets.tracks import palm_frame, rotation
+from flashdex.datasets.tracks import rotation
 from flashdex.errors import DemoError
 from flashdex.keys import FINGERS, SIDES, Side
 
@@ -34,17 +34,7 @@ PALM_IN_WRIST = np.diag([1.0, -1.0, -1.0])
 def make_demo(
     clip: dict[str, Any], file: Path, name: str, folders: tuple[Path, ...]
 ) -> HumanDemo:
-    """A clip's arrays as a motion.
-
-    Args:
-        clip: arrays by the names of ``human_demo/<clip>.npz``.
-        file: they come from, for messages.
-        name: of the motion.
-        folders: of meshes.
-
-    Raises:
-        DemoError: no hand, no object, or arrays of another shape.
-    """
+    """A clip's arrays as a motion."""
     hands: list[Side] = [s for s in SIDES if f"mano_{s}_joints" in clip]
     if not hands:
         raise DemoError(
@@ -52,23 +42,22 @@ def make_demo(
             f"{', '.join(sorted(clip))}. Is this a clip of FlashDexRetarget?"
         )
     keypoints: dict[Side, np.ndarray] = {s: _keypoints(clip, s, file) for s in hands}
-    palm: dict[Side, np.ndarray] = {s: palm_frame(keypoints[s], s) for s in hands}
     bodies, hand_object, notes = _objects(clip, hands, file, folders)
     further, told = context_objects(clip, bodies, lambda o: seek_mesh(o, folders), file)
     height, decision = support_height(clip, [body.pose for body in bodies])
-    angles = {s: _wrist_angle(clip, s, palm[s]) for s in hands}
-    return HumanDemo(
+    demo = HumanDemo(
         name=name,
         fps=number(clip["fps"], what=f"{file}: fps"),
         keypoints=keypoints,
-        palm=palm,
         objects=bodies + further,
         hand_object=hand_object,
         source="fdr",
         licence=LICENCE,
         support_z=height,
-        provenance={"support": decision, "wrist_to_palm_deg": angles} | notes | told,
     )
+    angles = {s: _wrist_angle(clip, s, demo.palm[s]) for s in hands}
+    demo.provenance = {"support": decision, "wrist_to_palm_deg": angles} | notes | told
+    return demo
 
 
 def _keypoints(clip: dict[str, Any], side: Side, file: Path) -> np.ndarray:

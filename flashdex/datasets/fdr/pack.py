@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from flashdex.datasets.fields import number, numbers
-from flashdex.datasets.pickles import load_torch
+from flashdex.datasets.fields import number, numbers, require
+from flashdex.datasets.files import load_torch
 from flashdex.datasets.tracks import VELOCITY_SIGMA
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
@@ -48,15 +48,8 @@ def pack_objects(file: Path) -> list[str]:
 def unpack(file: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """The arrays of one clip, by the names of ``human_demo/<clip>.npz``.
 
-    Args:
-        file: the packed collection.
-        row: of the clip.
-
     Returns:
         The clip, with ``fps``, and what is to be told about it.
-
-    Raises:
-        DemoError: rows or slots that the file does not have.
     """
     pack = _open(file)
     start = int(pack["length_starts"][row])
@@ -147,11 +140,5 @@ def _open(file: Path) -> dict[str, Any]:
 @lru_cache(maxsize=1)  # a worker reads many clips of one file
 def _load(file: Path, stamp: int) -> dict[str, Any]:
     pack = load_torch(file)
-    found = sorted(map(str, pack)) if isinstance(pack, dict) else [type(pack).__name__]
-    missing = [key for key in REQUIRED if key not in found]
-    if missing:
-        raise DemoError(
-            f"{file}: lacks {', '.join(missing)}. Found: {', '.join(found)}. Is this "
-            f"the motion.pt of FlashDexRetarget?"
-        )
+    require(pack, *REQUIRED, where=f"{file}: not a motion.pt of FlashDexRetarget")
     return pack

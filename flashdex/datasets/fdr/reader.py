@@ -9,6 +9,7 @@ A clip holds per hand (s = left, right) ``mano_{s}_joints`` (T, 20, 3), named
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.fdr.clip import LICENCE, make_demo
 from flashdex.datasets.fdr.pack import NAME as PACK_NAME
 from flashdex.datasets.fdr.pack import pack_names, pack_objects, unpack
-from flashdex.datasets.fields import words
-from flashdex.datasets.pickles import load_npz
-from flashdex.datasets.roots import refuse_clone, seek_mesh
+from flashdex.datasets.fields import require, words
+from flashdex.datasets.files import load_npz, refuse_clone
+from flashdex.datasets.roots import seek_mesh, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
@@ -27,13 +28,8 @@ CLIP_FOLDERS = ("human_demo", "retargeted")
 
 
 def list_fdr(options: SourceOptions) -> list[Recording]:
-    """Clips of a dataset folder, a folder of clips, one clip, or a ``motion.pt``.
-
-    Raises:
-        DemoError: there are neither clips nor a ``motion.pt``.
-    """
-    assert options.path is not None  # ``Source.needs``
-    clips, pack = _find(options.path)
+    """Clips of a dataset folder, a folder of clips, one clip, or a ``motion.pt``."""
+    clips, pack = _find(options.folder("path"))
     refuse_clone([pack] if pack else clips[:1])
     if pack is not None:
         folders = mesh_folders(pack.parent, options.models)
@@ -66,31 +62,16 @@ def mesh_folders(folder: Path, objects: Path | None) -> tuple[Path, ...]:
 
 
 def read_clip(file: Path, folders: tuple[Path, ...]) -> list[HumanDemo]:
-    """One clip as one motion.
-
-    Args:
-        file: ``<clip>.npz``.
-        folders: of meshes, in the order in which they are searched.
-
-    Raises:
-        DemoError: what is missing, or has another shape.
-    """
+    """One clip as one motion."""
     clip = load_npz(file)
-    if "fps" not in clip:
-        raise DemoError(f"{file}: lacks fps. Found: {', '.join(sorted(clip))}.")
+    require(clip, "fps", where=str(file))
     demo = make_demo(clip, file, file.stem, folders)
     demo.provenance |= {"files": [file.name]}
     return [demo]
 
 
 def read_packed(file: Path, row: int, folders: tuple[Path, ...]) -> list[HumanDemo]:
-    """One clip of a ``motion.pt`` as one motion.
-
-    Args:
-        file: the packed collection.
-        row: of the clip.
-        folders: of meshes, in the order in which they are searched.
-    """
+    """One clip of a ``motion.pt`` as one motion."""
     clip, notes = unpack(file, row)
     demo = make_demo(clip, file, pack_names(file)[row], folders)
     demo.provenance |= {"files": [file.name], "row": row} | notes
@@ -108,11 +89,11 @@ def _find(path: Path) -> tuple[list[Path], Path | None]:
             return sorted(clips), None
     if (path / PACK_NAME).is_file():
         return [], path / PACK_NAME
-    names = sorted(e.name for e in path.iterdir())[:8] if path.is_dir() else []
     raise DemoError(
-        f"{path}: no clips of FlashDexRetarget (E_ROOT). Sought human_demo/*.npz, "
+        f"{path}: no clips of FlashDexRetarget. Sought human_demo/*.npz, "
         f"*.npz, retargeted/*.npz and motion.pt; found: "
-        f"{', '.join(names) or 'nothing'}. Give the folder that its import writes."
+        f"{shown(path)}. Give the folder that its import writes.",
+        code="E_ROOT",
     )
 
 
@@ -128,16 +109,15 @@ def _ids(clip: Path) -> list[str]:
 
 def _existing(names: list[str], folders: tuple[Path, ...]) -> tuple[Path, ...]:
     """Meshes that exist; reading tells which one is missing or wrong."""
-    found = []
+    found: list[Path | None] = []
     for name in names:
-        try:
+        with suppress(DemoError, OSError):
             found.append(seek_mesh(name, folders))
-        except (DemoError, OSError):
-            continue
     return tuple(file for file in found if file is not None)
 
 
-FDR = Source(
+SOURCE = Source(
+    name="fdr",
     list=list_fdr,
     about="clips of FlashDexRetarget: human_demo/<clip>.npz, or its motion.pt",
     licence=LICENCE,

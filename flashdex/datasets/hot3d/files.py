@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flashdex.datasets.roots import refuse_pointer
+from flashdex.datasets.files import refuse_pointer, told
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
@@ -21,40 +21,24 @@ POSE_COLUMNS = (*POSE_HEADER.split(","), "q_wo_w", "q_wo_x", "q_wo_y", "q_wo_z")
 MASK_COLUMNS = ("timestamp[ns]", "stream_id", "mask")
 HAND_IDS: dict[str, Side] = {"0": "left", "1": "right"}
 MAX_STAMP = 1 << 62  # ns
-# what JSON of another layout, or nested too deep, raises
-BROKEN_JSON = (
-    *(ValueError, KeyError, TypeError, AttributeError),
-    *(OverflowError, RecursionError),
-)
 WRIST = 7  # first columns of a hand's row: position, quaternion wxyz
 
 
 @dataclass(frozen=True)
 class Track:
-    """Rows of one body.
+    """Rows of one body."""
 
-    Args:
-        times: ns, ascending, (N,) int64.
-        values: a row a time, (N, D).
-    """
-
-    times: np.ndarray
-    values: np.ndarray
+    times: np.ndarray  # ns, ascending, (N,) int64
+    values: np.ndarray  # a row a time, (N, D)
 
 
 @dataclass(frozen=True)
 class Mask:
-    """Rows of a mask file: one per time and camera stream.
+    """Rows of a mask file: one per time and camera stream."""
 
-    Args:
-        times: ns, (N,) int64.
-        streams: such as ``214-1``, (N,).
-        values: whether the frame may be used, (N,) bool.
-    """
-
-    times: np.ndarray
-    streams: np.ndarray
-    values: np.ndarray
+    times: np.ndarray  # ns, (N,) int64
+    streams: np.ndarray  # such as ``214-1``, (N,)
+    values: np.ndarray  # whether the frame may be used, (N,) bool
 
 
 def read_poses(file: Path) -> dict[str, Track]:
@@ -139,16 +123,9 @@ def _hand_row(hand: dict[str, Any], widths: dict[str, int]) -> list[float]:
     return [float(value) for values, _ in parts for value in values]
 
 
-@contextmanager
-def _cells(file: Path, line: int) -> Iterator[None]:
-    """Turns what a malformed row raises into one message with its line."""
-    try:
-        yield
-    except BROKEN_JSON as error:
-        raise DemoError(
-            f"{file}, line {line}: not a row of this file: {error!r}. Download the "
-            f"file again."
-        ) from error
+def _cells(file: Path, line: int) -> AbstractContextManager[None]:
+    fault = "not a row of this file (download it again)"
+    return told(f"{file}, line {line}", fault)
 
 
 def read_lines(file: Path) -> list[str]:
@@ -163,8 +140,9 @@ def read_lines(file: Path) -> list[str]:
     except FileNotFoundError as error:
         found = ", ".join(sorted(p.name for p in file.parent.glob("*"))) or "nothing"
         raise DemoError(
-            f"{file}: not found (E_FILE). The folder holds {found}. Download "
-            f"'ground_truth' and 'hand_data' of the sequence."
+            f"{file}: not found. The folder holds {found}. Download "
+            f"'ground_truth' and 'hand_data' of the sequence.",
+            code="E_FILE",
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise DemoError(f"{file}: not readable as text: {error}") from error
@@ -213,20 +191,14 @@ MAX_SECONDS = 4 * 3600  # no session is longer: one wrong stamp would make it ye
 
 @dataclass(frozen=True)
 class FrameAxis:
-    """Uniform frames at 30 fps.
+    """Uniform frames at 30 fps."""
 
-    Args:
-        times: stamp of each frame, ns, ascending, (T,); nominal where a frame was not
-            recorded.
-        recorded: frames that have a stamp of their own, (T,) bool.
-        fps: the rate that was measured.
-        rule: how doubled stamps were told apart.
-    """
-
+    # stamp of each frame, ns, ascending, (T,); nominal where a frame was not
+    # recorded
     times: np.ndarray
-    recorded: np.ndarray
-    fps: float
-    rule: str
+    recorded: np.ndarray  # frames that have a stamp of their own, (T,) bool
+    fps: float  # the rate that was measured
+    rule: str  # how doubled stamps were told apart
 
     def frame_of(self, times: np.ndarray) -> np.ndarray:
         """The frame within 5 ms of each time (ns, (N,)), -1 without one."""
@@ -287,8 +259,9 @@ def frame_axis(name: str, tracks: Iterable[Track], mask: Mask | None) -> FrameAx
     steps = np.diff(kept)
     if (seconds := (kept[-1] - kept[0]) / SECOND) > MAX_SECONDS:
         raise DemoError(
-            f"{name}: W_GAP: its stamps span {seconds:.0f} s, the longest step "
-            f"{steps.max() / SECOND:.0f} s. One is wrong; download the file again."
+            f"{name}: its stamps span {seconds:.0f} s, the longest step "
+            f"{steps.max() / SECOND:.0f} s. One is wrong; download the file again.",
+            code="W_GAP",
         )
     fps = float(SECOND / np.median(steps))
     if abs(fps / FPS - 1) > RATE_TOLERANCE:

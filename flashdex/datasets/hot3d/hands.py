@@ -14,11 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flashdex.datasets.body_models.mano import (
-    ManoModel,
-    load_mano,
-    rotations_from_axis_angle,
-)
+from flashdex.datasets.body_models.mano import ManoModel, load_mano
 from flashdex.datasets.body_models.umetrack import load_umetrack
 from flashdex.datasets.hot3d.files import WRIST, FrameAxis, Track, read_hands
 from flashdex.datasets.tracks import rotation
@@ -50,9 +46,6 @@ def read_keypoints(
     Returns:
         Per recorded hand (T, 21, 3), m, world, NaN where it was not tracked; and
         entries for the provenance.
-
-    Raises:
-        DemoError: a file is missing or wrong, or no hand was tracked.
     """
     if mano is None:
         hands, notes = _read_umetrack(folder, axis)
@@ -106,11 +99,13 @@ def mano_keypoints(model: ManoModel, rows: np.ndarray) -> np.ndarray:
         group = seen & (rows[:, BETAS] == betas).all(axis=1)
         root = rotation(rows[group, 3:WRIST]).as_rotvec()
         fingers = model.finger_pose(rows[group, POSE], flat=False)
-        out[group] = model.keypoints(
-            rotations_from_axis_angle(np.concatenate([root, fingers], axis=1)),
-            betas,
+        out[group] = model.keypoints_of(
+            root,
+            fingers,
             rows[group, :3],
+            betas=betas,
             convention="joint",
+            where="hand poses",
         )
     return out
 

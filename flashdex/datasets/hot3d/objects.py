@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from flashdex.datasets.demo import DemoObject
-from flashdex.datasets.hot3d.files import BROKEN_JSON, FrameAxis, Track, read_lines
-from flashdex.datasets.roots import refuse_clone, refuse_pointer
+from flashdex.datasets.files import read_json, refuse_clone, refuse_pointer, told
+from flashdex.datasets.hot3d.files import FrameAxis, Track
 from flashdex.errors import DemoError
 
 LIBRARY_NAMES = ("assets", "object_models", "object_library")
@@ -21,11 +20,7 @@ MIN_NORM = 0.5  # of a quaternion; below, it is a filler and no rotation
 
 @dataclass(frozen=True)
 class ObjectLibrary:
-    """Folder of ``<uid>.glb`` and the names of the objects.
-
-    Args:
-        folder: that holds the models.
-    """
+    """Folder of ``<uid>.glb`` and the names of the objects."""
 
     folder: Path
 
@@ -38,13 +33,10 @@ class ObjectLibrary:
         file = self.folder / INSTANCES
         if not file.is_file():
             return {}
-        try:
-            found = json.loads("\n".join(read_lines(file)))
+        fault = "not {uid: {instance_name: ...}}"
+        with told(file, fault):
+            found = read_json(file, fault)
             return {uid: str(body["instance_name"]) for uid, body in found.items()}
-        except BROKEN_JSON as error:
-            raise DemoError(
-                f"{file}: expected {{uid: {{instance_name: ...}}}}: {error!r}"
-            ) from error
 
     def key(self) -> str:
         """Names and sizes of all models, as text: changes when one is added."""
@@ -53,15 +45,7 @@ class ObjectLibrary:
 
 
 def find_library(root: Path, given: Path | None) -> ObjectLibrary:
-    """The object library: the folder given, or one beside or in the dataset.
-
-    Args:
-        root: of the dataset or of one sequence.
-        given: by the user (``--models``); may be one level too high.
-
-    Raises:
-        DemoError: there is none, or its models are Git LFS pointers.
-    """
+    """The object library: the folder given, or one beside or in the dataset."""
     if given is not None:
         places = [given, *(given / name for name in LIBRARY_NAMES)]
     else:
@@ -76,9 +60,10 @@ def find_library(root: Path, given: Path | None) -> ObjectLibrary:
     archives = sorted(p.name for p in (given or root).glob("*.zip"))
     unpack = f" Unpack {', '.join(archives[:3])} first." if archives else ""
     raise DemoError(
-        f"{given or root}: no object models (E_ROOT): <uid>.glb and {INSTANCES}. "
+        f"{given or root}: no object models: <uid>.glb and {INSTANCES}. "
         f"Sought in {sought}. Download the object library of HOT3D and give it as "
-        f"--models.{unpack}"
+        f"--models.{unpack}",
+        code="E_ROOT",
     )
 
 
@@ -102,9 +87,6 @@ def read_objects(
 
     Returns:
         The objects; and for the provenance: which have no model, which moves most.
-
-    Raises:
-        DemoError: no object with a model is left.
     """
     names = names | library.names()
     found: list[DemoObject] = []

@@ -17,6 +17,7 @@ import numpy as np
 
 from flashdex.datasets.body_models.mano import mano_pair
 from flashdex.datasets.demo import HumanDemo
+from flashdex.datasets.files import refuse_clone
 from flashdex.datasets.hot3d.files import (
     FPS,
     FrameAxis,
@@ -38,13 +39,10 @@ from flashdex.datasets.hot3d.world import (
     refuse_without_truth,
     up_axis,
 )
-from flashdex.datasets.roots import refuse_clone, relative
+from flashdex.datasets.roots import relative, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 
-SOURCE = "hot3d"
-LICENCE = "HOT3D licence agreement (projectaria.com); no redistribution"
 OBJECTS_FILE = "dynamic_objects.csv"
 HEADSET_FILE = "headset_trajectory.csv"
 METADATA_FILE = "metadata.json"
@@ -63,17 +61,11 @@ HEAD_BYTES = 65536  # of the object poses that are looked at when listing
 
 
 def list_hot3d(options: SourceOptions) -> list[Recording]:
-    """Sequences of a root, in name order.
-
-    Raises:
-        DemoError: the root holds no sequence, there is no object library, or the
-            MANO models are not where they were said to be.
-    """
-    root = options.path
-    assert root is not None  # ``Source.needs``
+    """Sequences of a root, in name order."""
+    root = options.folder("path")
     folders = _find_sequences(root)
     if not folders:
-        raise DemoError(_wrong_root(root))
+        raise DemoError(_wrong_root(root), code="E_ROOT")
     refuse_clone([folders[0] / OBJECTS_FILE])
     library = find_library(root, options.models)
     mano = options.mano
@@ -118,10 +110,7 @@ def _is_sequence(folder: Path) -> bool:
 def _wrong_root(root: Path) -> str:
     sought = f"{OBJECTS_FILE} in it, in P####_*/, or in those of {', '.join(GROUPS)}"
     if not root.exists():
-        return f"{root}: no such folder (E_ROOT). Expected a folder of HOT3D sequences."
-    found = (
-        sorted(path.name for path in root.iterdir()) if root.is_dir() else ["a file"]
-    )
+        return f"{root}: no such folder. Expected a folder of HOT3D sequences."
     hint = "Give the folder of the sequences, or one sequence."
     if (root.parent / OBJECTS_FILE).is_file():
         hint = f"This is a part of a sequence: give {root.parent}."
@@ -129,12 +118,9 @@ def _wrong_root(root: Path) -> str:
         root.glob(f"*/*/{OBJECTS_FILE}"), None
     ):
         hint = f"Sequences lie deeper: give {deeper.parents[1]}."
-    elif any(name.endswith(".zip") for name in found):
+    elif next(root.glob("*.zip"), None):
         hint = "Unpack the .zip files first."
-    return (
-        f"{root}: no HOT3D sequence (E_ROOT). Sought {sought}. Found "
-        f"{', '.join(found[:8]) or 'nothing'}. {hint}"
-    )
+    return f"{root}: no HOT3D sequence. Sought {sought}. Found {shown(root)}. {hint}"
 
 
 def _sequence_files(folder: Path) -> tuple[Path, ...]:
@@ -171,9 +157,6 @@ def read_sequence(
         root: of the dataset.
         library: of the object models.
         mano: folder of the MANO models; None for UmeTrack keypoints.
-
-    Raises:
-        DemoError: a file is missing or wrong, or the sequence has no ground truth.
     """
     metadata = read_metadata(folder / METADATA_FILE)
     refuse_without_truth(folder, metadata, "umetrack" if mano is None else "mano")
@@ -196,10 +179,9 @@ def read_sequence(
             name=folder.name,
             fps=FPS,
             keypoints=keypoints,
-            palm={side: palm_frame(k, side) for side, k in keypoints.items()},
             objects=objects,
-            source=SOURCE,
-            licence=LICENCE,
+            source=SOURCE.name,
+            licence=SOURCE.licence,
             up=up,
             needs_cutting=True,
             split=_split(folder, metadata.participant),
@@ -258,9 +240,10 @@ def _split(folder: Path, participant: str) -> str:
     return "test" if participant in TEST_PARTICIPANTS else "train"
 
 
-HOT3D = Source(
+SOURCE = Source(
+    name="hot3d",
     list=list_hot3d,
     about="HOT3D sequences (ground truth and hand data; --models: its object "
     "library, --mano: MANO models, else UmeTrack keypoints)",
-    licence=LICENCE,
+    licence="HOT3D licence agreement (projectaria.com); no redistribution",
 )

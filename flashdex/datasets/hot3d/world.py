@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flashdex.datasets.hot3d.files import BROKEN_JSON, read_lines
+from flashdex.datasets.files import told
+from flashdex.datasets.hot3d.files import read_lines
 from flashdex.errors import DemoError
 
 Up = Literal["z", "y"]
@@ -23,31 +24,22 @@ FLATTER = 3.0
 
 @dataclass(frozen=True)
 class Metadata:
-    """What ``metadata.json`` says, in either of its two layouts.
+    """What ``metadata.json`` says, in either of its two layouts."""
 
-    Args:
-        headset: ``Aria``, ``Quest3``.
-        participant: such as ``P0003``.
-        truth: whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a
-            kind of which nothing is said is missing here.
-        names: of the objects, by uid, where they are listed.
-        version: of the dataset, where it is given.
-    """
-
-    headset: str
-    participant: str
+    headset: str  # ``Aria``, ``Quest3``
+    participant: str  # such as ``P0003``
+    # whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a kind
+    # of which nothing is said is missing here
     truth: dict[str, bool] = field(default_factory=dict)
+    # of the objects, by uid, where they are listed
     names: dict[str, str] = field(default_factory=dict)
-    version: str = ""
+    version: str = ""  # of the dataset, where it is given
 
 
 def read_metadata(file: Path) -> Metadata:
-    """``metadata.json``, old and new layout.
-
-    Raises:
-        DemoError: the file is missing or not of this kind.
-    """
-    try:
+    """``metadata.json``, old and new layout."""
+    fault = "not the metadata of a HOT3D sequence, JSON with headset, participant_id"
+    with told(file, fault):
         data = json.loads("\n".join(read_lines(file)))
         uids, names = data.get("object_uids") or [], data.get("object_names") or []
         return Metadata(
@@ -57,11 +49,6 @@ def read_metadata(file: Path) -> Metadata:
             names={str(u): str(n) for u, n in zip(uids, names, strict=False)},
             version=next((str(v) for k, v in data.items() if "version" in k), ""),
         )
-    except BROKEN_JSON as error:
-        raise DemoError(
-            f"{file}: not the metadata of a HOT3D sequence: {error!r}. Expected JSON "
-            f"with 'headset' and 'participant_id'."
-        ) from error
 
 
 def _truth(data: dict[str, Any]) -> dict[str, bool]:
@@ -83,9 +70,6 @@ def refuse_without_truth(folder: Path, metadata: Metadata, hands: str) -> None:
         folder: of the sequence.
         metadata: of it.
         hands: the kind of hand poses that is wanted, ``mano`` or ``umetrack``.
-
-    Raises:
-        DemoError: says which poses are missing.
     """
     kinds = {"objects": "object poses", hands: f"{hands} hand poses"}
     missing = [
@@ -119,9 +103,6 @@ def up_axis(
 
     Returns:
         The axis, and what was measured.
-
-    Raises:
-        DemoError: another headset, or the data contradict it.
     """
     kind = next((kind for kind in UP_OF if headset.lower().startswith(kind)), None)
     if kind is None:

@@ -8,17 +8,19 @@ mesh, metres. ``flashdex.datasets.oakink2.sequence`` reads a sequence.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 from flashdex.datasets.body_models.mano import mano_pair
+from flashdex.datasets.files import refuse_clone
 from flashdex.datasets.oakink2.annotation import (
     ANNOTATIONS,
     OakInk2Sequence,
     read_program,
 )
 from flashdex.datasets.oakink2.sequence import read_sequence
-from flashdex.datasets.roots import refuse_clone, require_folders
+from flashdex.datasets.roots import require_folders
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 
@@ -28,14 +30,8 @@ ALIGNED = "align_ds"
 
 
 def list_oakink2(options: SourceOptions) -> list[Recording]:
-    """All annotated sequences, in name order.
-
-    Raises:
-        DemoError: the root is not OakInk2's, or MANO is at fault.
-    """
-    root, mano = options.path, options.mano
-    assert root is not None  # ``Source.needs``
-    assert mano is not None
+    """All annotated sequences, in name order."""
+    root, mano = options.folder("path"), options.folder("mano")
     require_folders(root, (ANNOTATIONS,), dataset="OakInk2")
     folders = _find_mesh_folders(root, options.models)
     models = mano_pair(mano)
@@ -62,9 +58,10 @@ def _find_mesh_folders(root: Path, extra: Path | None) -> tuple[Path, ...]:
     found = tuple(place for place in places if place.is_dir())
     if not found:
         raise DemoError(
-            f"{root}: E_ROOT: no meshes. Sought "
+            f"{root}: no meshes. Sought "
             f"{', '.join(f'{r}/{ALIGNED}' for r in MESH_FOLDERS)}. Unpack "
-            f"object_repair.tar or object_raw.tar there, or name it with --models."
+            f"object_repair.tar or object_raw.tar there, or name it with --models.",
+            code="E_ROOT",
         )
     return found
 
@@ -80,10 +77,8 @@ def _files(sequence: OakInk2Sequence) -> list[Path]:
         each = [entry for place in sequence.mesh_folders for entry in place.iterdir()]
         names = {entry.name for entry in each if entry.is_dir()}
     for name in sorted(names):
-        try:
+        with suppress(DemoError):  # reading tells, if the sequence needs it
             files.append(sequence.mesh_file(name))
-        except DemoError:
-            continue  # reading tells, if the sequence needs it
     return files
 
 
@@ -97,7 +92,8 @@ def _program_objects(file: Path) -> set[str]:
     return {name for p in primitives for name in p.objects} if known else set()
 
 
-OAKINK2 = Source(
+SOURCE = Source(
+    name="oakink2",
     list=list_oakink2,
     about="OakInk2: anno_preview, program and object_repair of bimanual tasks",
     licence="see the dataset card (version 1: CC BY-NC-SA 4.0); MANO under its own",

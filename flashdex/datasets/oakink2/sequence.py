@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.body_models.mano import load_mano, rotations_from_quats
 from flashdex.datasets.demo import DemoObject, HumanDemo
+from flashdex.datasets.files import refuse_pointer
 from flashdex.datasets.oakink2.annotation import (
     Annotation,
     OakInk2Sequence,
@@ -23,9 +24,9 @@ from flashdex.datasets.oakink2.annotation import (
     read_annotation,
     read_program,
 )
-from flashdex.datasets.roots import refuse_pointer, relative
+from flashdex.datasets.roots import relative
 from flashdex.datasets.support import estimate_support
-from flashdex.datasets.tracks import palm_frame, transform_pose
+from flashdex.datasets.tracks import transform_pose
 from flashdex.errors import DemoError, MeshError
 from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import hull_vertices, load_mesh
@@ -37,11 +38,7 @@ LICENCE = "OakInk2, see its dataset card (version 1 is CC BY-NC-SA 4.0)"
 
 
 def read_sequence(sequence: OakInk2Sequence) -> list[HumanDemo]:
-    """All primitives of a sequence as motions, or the whole sequence as one.
-
-    Raises:
-        DemoError: a file is missing or wrong, or a primitive lies outside of it.
-    """
+    """All primitives of a sequence as motions, or the whole sequence as one."""
     refuse_pointer(sequence.annotation)
     annotation = read_annotation(sequence.annotation)
     primitives = [None]
@@ -81,7 +78,6 @@ def _demo(
         name=name,
         fps=FPS,
         keypoints=keypoints,
-        palm={s: palm_frame(k, s) for s, k in keypoints.items()},
         objects=[DemoObject(b.name, b.mesh, b.pose[frames]) for b in bodies],
         source="oakink2",
         licence=LICENCE,
@@ -120,9 +116,10 @@ def _refuse_outside(
 ) -> None:
     if item.begin < begin or item.end > end:
         raise DemoError(
-            f"{sequence.program}: E_LEN: primitive '{item.name}' has the mocap ids "
+            f"{sequence.program}: primitive '{item.name}' has the mocap ids "
             f"{item.begin} to {item.end}, the annotation {begin} to {end} (end "
-            f"excluded). Program and annotation are not of the same release."
+            f"excluded). Program and annotation are not of the same release.",
+            code="E_LEN",
         )
 
 
@@ -135,8 +132,9 @@ def _body(
     """An object over the whole sequence, under a name that is a plain file name."""
     if name not in annotation.poses:
         raise DemoError(
-            f"{sequence.program}: E_KEYS: object {name!r} is not in "
-            f"{sequence.annotation.name}; there are {', '.join(annotation.poses)}."
+            f"{sequence.program}: object {name!r} is not in "
+            f"{sequence.annotation.name}; there are {', '.join(annotation.poses)}.",
+            code="E_KEYS",
         )
     if name not in meshes:
         file = sequence.mesh_file(name)
@@ -150,9 +148,9 @@ def _load_mesh(file: Path) -> trimesh.Trimesh:
         mesh = load_mesh(file)
         _ = mesh.convex_hull  # kept by the mesh
     except MeshError as error:
-        raise DemoError(str(error)) from error
+        raise DemoError(error.text, code="E_MESH") from error
     except (QhullError, ValueError, IndexError) as error:
-        raise DemoError(f"{file}: E_MESH: flat, empty or not finite.") from error
+        raise DemoError(f"{file}: flat, empty or not finite.", code="E_MESH") from error
     return mesh
 
 

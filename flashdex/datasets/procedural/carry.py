@@ -30,25 +30,15 @@ OPENING = 0.5
 
 @dataclass
 class CarryPlan:
-    """What happens to the object.
+    """What happens to the object."""
 
-    Args:
-        start: where it stands, m, (2,).
-        move: horizontal displacement, m, (2,).
-        lift: highest point of the carry above the start, m.
-        turn: rotation about z between start and end, rad.
-        tilt: largest inclination in mid carry, rad.
-        yaw: direction of the grasp axis (thumb to fingers) in the world, rad.
-        speed: 1 is the nominal pace.
-    """
-
-    start: np.ndarray
-    move: np.ndarray
-    lift: float
-    turn: float
-    tilt: float
-    yaw: float
-    speed: float
+    start: np.ndarray  # where it stands, m, (2,)
+    move: np.ndarray  # horizontal displacement, m, (2,)
+    lift: float  # highest point of the carry above the start, m
+    turn: float  # rotation about z between start and end, rad
+    tilt: float  # largest inclination in mid carry, rad
+    yaw: float  # direction of the grasp axis (thumb to fingers) in the world, rad
+    speed: float  # 1 is the nominal pace
 
 
 @dataclass

@@ -21,13 +21,11 @@ from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.procedural.carry import CarryPlan, Track, carry_track
 from flashdex.datasets.procedural.shapes import SHAPES
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.datasets.tracks import continuous, palm_frame, to_quat
+from flashdex.datasets.tracks import continuous, to_quat
 from flashdex.errors import UnknownSourceError
 from flashdex.keys import SIDES, Side
 
 Action = Literal["pick", "turn", "tilt"]
-SOURCE = "procedural"
-LICENCE = "Apache-2.0"
 FPS = 60.0
 NOISE_RIGID = 0.0018  # m, of the whole hand
 NOISE_TURN = np.deg2rad(1.0)
@@ -142,11 +140,10 @@ def _make(name_of_kind: str, name: str, seed: int, again: int) -> list[HumanDemo
         name=name,
         fps=FPS,
         keypoints=keypoints,
-        palm={s: palm_frame(k, s) for s, k in keypoints.items()},
         objects=objects,
         hand_object={side: i for i, side in enumerate(tracks)},
-        source=SOURCE,
-        licence=LICENCE,
+        source=SOURCE.name,
+        licence=SOURCE.licence,
         support_z=0.0,
         task=kind.action,
         provenance={"seed": seed, "again": again},
@@ -191,9 +188,11 @@ def smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray
     return smooth * np.sqrt(2 * np.sqrt(np.pi) * sigma)
 
 
-PROCEDURAL = Source(
+SOURCE = Source(
+    name="procedural",
     list=list_procedural,
     about="nothing: makes motions up. --input quickstart, all, or kinds with commas",
-    licence=LICENCE,
+    licence="Apache-2.0",
     needs=(),
+    made_up=True,
 )

@@ -19,21 +19,13 @@ Approach = Literal["top", "side"]
 
 @dataclass
 class Shape:
-    """A mesh and the grasp that suits it.
+    """A mesh and the grasp that suits it."""
 
-    Args:
-        mesh: metres, rest pose, centred.
-        approach: from above across the object, or from the side around it.
-        height: of the contacts above the object's lowest point, m.
-        across: grasp axis in the object frame, unit, horizontal (3,).
-        fingers: how many fingers oppose the thumb.
-    """
-
-    mesh: trimesh.Trimesh
-    approach: Approach
-    height: float
-    across: np.ndarray
-    fingers: int
+    mesh: trimesh.Trimesh  # metres, rest pose, centred
+    approach: Approach  # from above across the object, or from the side around it
+    height: float  # of the contacts above the object's lowest point, m
+    across: np.ndarray  # grasp axis in the object frame, unit, horizontal (3,)
+    fingers: int  # how many fingers oppose the thumb
 
 
 X_AXIS = np.array([1.0, 0.0, 0.0])

@@ -18,8 +18,8 @@ import numpy as np
 
 from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.fields import number, numbers
-from flashdex.datasets.pickles import load_npz
-from flashdex.datasets.roots import refuse_clone
+from flashdex.datasets.files import load_npz, refuse_clone
+from flashdex.datasets.roots import shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.spider.hand import fill_hand
 from flashdex.datasets.spider.scene import (
@@ -30,7 +30,7 @@ from flashdex.datasets.spider.scene import (
     read_objects,
     task_info,
 )
-from flashdex.datasets.tracks import FARTHEST, palm_frame
+from flashdex.datasets.tracks import FARTHEST
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
@@ -54,45 +54,30 @@ JOINT_KEYS = {"qpos_pip_{}": (2, 6, 10, 14, 18), "qpos_dip_{}": (3, 7, 11, 15, 1
 
 
 def list_spider(options: SourceOptions) -> list[Recording]:
-    """All references below a folder, or one file, in path order.
-
-    Raises:
-        DemoError: there is none.
-    """
-    path = options.path
-    assert path is not None  # ``Source.needs``
+    """All references below a folder, or one file, in path order."""
+    path = options.folder("path")
     files = [path] if path.is_file() else sorted(path.rglob(FILE))
     if not files:
-        below = sorted(e.name for e in path.iterdir())[:8] if path.is_dir() else []
         raise DemoError(
-            f"{path}: no {FILE} (E_ROOT). Found: {', '.join(below) or 'nothing'}. Give "
+            f"{path}: no {FILE}. Found: {shown(path)}. Give "
             f"SPIDER's dataset folder (the one that holds processed/), or unpack it. "
-            f"Robot results (trajectory_mjwp.npz) are not human references."
+            f"Robot results (trajectory_mjwp.npz) are not human references.",
+            code="E_ROOT",
         )
     refuse_clone(files[:1])
     names = [_name(file) for file in files]
-    recordings = []
-    for name, file in zip(names, files, strict=True):
-        recordings.append(
-            Recording(
-                name=name if names.count(name) == 1 else _full_name(file),
-                read=partial(read_spider, file, options.models),
-                files=(file, *known_files(file, options.models)),
-            )
+    return [
+        Recording(
+            name=name if names.count(name) == 1 else _full_name(file),
+            read=partial(read_spider, file, options.models),
+            files=(file, *known_files(file, options.models)),
         )
-    return recordings
+        for name, file in zip(names, files, strict=True)
+    ]
 
 
 def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
-    """One reference as one motion.
-
-    Args:
-        file: ``trajectory_keypoints.npz``.
-        objects: folder of the meshes, if they lie apart.
-
-    Raises:
-        DemoError: no hand, no object with a mesh, or arrays of another shape.
-    """
+    """One reference as one motion."""
     data, (info, info_file) = load_npz(file), task_info(file)
     dataset = _dataset(file, info)
     keypoints: dict[Side, np.ndarray] = {}
@@ -115,11 +100,10 @@ def read_spider(file: Path, objects: Path | None = None) -> list[HumanDemo]:
             name=_name(file),
             fps=1 / step,
             keypoints=keypoints,
-            palm={side: palm_frame(k, side) for side, k in keypoints.items()},
             objects=[body for _, body in bodies],
             hand_object=hand_object(bodies, list(keypoints)),
-            source="spider",
-            licence=SPIDER.licence,
+            source=SOURCE.name,
+            licence=SOURCE.licence,
             task=str(info.get("task", "")),
             provenance={
                 "files": [file.name, *([INFO] if info_file else [])],
@@ -193,7 +177,8 @@ def _full_name(file: Path) -> str:
     return "_".join(file.parent.parts[-5:])
 
 
-SPIDER = Source(
+SOURCE = Source(
+    name="spider",
     list=list_spider,
     about="SPIDER's processed human references (trajectory_keypoints.npz)",
     licence="that of the recordings they were made from; SPIDER itself is CC BY-NC 4.0",

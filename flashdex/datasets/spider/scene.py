@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from flashdex.datasets.demo import QUAT_TOLERANCE, DemoObject
 from flashdex.datasets.fields import numbers
+from flashdex.datasets.files import read_json
 from flashdex.datasets.roots import find_mesh, mesh_in
 from flashdex.datasets.tracks import FARTHEST
 from flashdex.errors import DemoError
@@ -84,21 +84,14 @@ def _tail(folder: str) -> str:
 
 
 def task_info(file: Path) -> tuple[dict[str, Any], Path | None]:
-    """``task_info.json`` beside a reference or one folder up; empty if there is none.
-
-    Raises:
-        DemoError: it is not a JSON object.
-    """
+    """``task_info.json`` beside a reference or one folder up; empty without one."""
     for folder in (file.parent, file.parent.parent):
-        if not (folder / INFO).is_file():
-            continue
-        try:
-            info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise DemoError(f"{folder / INFO}: not readable JSON: {error}") from error
-        if not isinstance(info, dict):
-            raise DemoError(f"{folder / INFO}: expected a JSON object.")
-        return info, folder / INFO
+        file = folder / INFO
+        if file.is_file():
+            info = read_json(file, "not readable JSON")
+            if not isinstance(info, dict):
+                raise DemoError(f"{file}: expected a JSON object.")
+            return info, file
     return {}, None
 
 

@@ -17,7 +17,8 @@ from functools import partial
 from pathlib import Path
 
 from flashdex.datasets.body_models.mano import mano_pair
-from flashdex.datasets.roots import refuse_clone, require_folders
+from flashdex.datasets.files import refuse_clone, told
+from flashdex.datasets.roots import require_folders
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.taco.sequence import (
     HANDS,
@@ -43,14 +44,8 @@ logger = logging.getLogger(__name__)
 
 
 def list_taco(options: SourceOptions) -> list[Recording]:
-    """All sequences that have hands or objects, in name order.
-
-    Raises:
-        DemoError: the root is not TACO's, or the split list or MANO is at fault.
-    """
-    root, mano = options.path, options.mano
-    assert root is not None  # ``Source.needs``
-    assert mano is not None
+    """All sequences that have hands or objects, in name order."""
+    root, mano = options.folder("path"), options.folder("mano")
     require_folders(root, (HANDS, OBJECTS), dataset="TACO")
     meshes = _find_meshes(root, options.models)
     models = mano_pair(mano)
@@ -92,8 +87,9 @@ def _find_meshes(root: Path, extra: Path | None) -> dict[str, Path]:
     if not found:
         sought = ", ".join(str(place) for place in places)
         raise DemoError(
-            f"{root}: E_ROOT: no meshes <id>{MESH_SUFFIX}. Sought in {sought}. "
-            f"Download Object_Models, or name its folder with --models."
+            f"{root}: no meshes <id>{MESH_SUFFIX}. Sought in {sought}. "
+            f"Download Object_Models, or name its folder with --models.",
+            code="E_ROOT",
         )
     return found
 
@@ -126,10 +122,8 @@ def _unique_names(folders: list[str]) -> list[str]:
 
 def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
     """Split of each sequence, from lines ``sequence,split``."""
-    try:
+    with told(file, "not a readable list of splits"):
         lines = file.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DemoError(f"{file}: not a readable list of splits: {error}") from error
     matches = [SPLIT_LINE.fullmatch(line) for line in lines]
     splits = {match[1]: match[2] for match in matches if match}
     known = {Path(folder).name for folder in folders}
@@ -142,7 +136,8 @@ def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
     return splits
 
 
-TACO = Source(
+SOURCE = Source(
+    name="taco",
     list=list_taco,
     about="TACO: Hand_Poses, Object_Poses and Object_Models of bimanual tool use",
     licence="CC BY 4.0; MANO under its own licence (non-commercial research)",

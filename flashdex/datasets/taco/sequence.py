@@ -6,104 +6,32 @@ metres. The origin lies somewhere below the table, so no height is claimed.
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flashdex.datasets.body_models.mano import load_mano, rotations_from_axis_angle
+from flashdex.datasets.body_models.mano import load_mano
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fields import poses_from_matrices, to_array
-from flashdex.datasets.pickles import load_pickle
-from flashdex.datasets.roots import refuse_pointer, relative, scaled_mesh
-from flashdex.datasets.tracks import palm_frame
+from flashdex.datasets.fields import numbers, part, poses_from_matrices, to_array
+from flashdex.datasets.files import load_pickle, refuse_pointer, told
+from flashdex.datasets.roots import relative, scaled_mesh
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
 NUM_POSE, NUM_BETAS = 48, 10
-
-
-def read_all_frames(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters of a file that holds all frames, by keys that sort in time.
-
-    Returns:
-        Axis-angle, rad, (T, 48), and wrist position, m, (T, 3).
-
-    Raises:
-        DemoError: the pickle is refused, or a frame lacks something.
-    """
-    frames = load_pickle(file)
-    if not isinstance(frames, dict) or not frames:
-        raise DemoError(
-            f"{file}: E_KEYS: holds a {type(frames).__name__}; expected a dict of "
-            f"frames, each with hand_pose and hand_trans."
-        )
-    keys = sorted(frames, key=_frame_order)
-    return _stack([(f"{file}, frame {key!r}", frames[key]) for key in keys])
-
-
-def read_frame_files(files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
-    """As ``read_all_frames``, from one file a frame, in time order."""
-    return _stack([(str(file), load_pickle(file)) for file in files])
-
-
-def read_shape(file: Path) -> np.ndarray:
-    """Shape of a hand, (10,).
-
-    Raises:
-        DemoError: the pickle is refused, or holds something else.
-    """
-    shape = load_pickle(file)
-    if not isinstance(shape, dict) or "hand_shape" not in shape:
-        raise DemoError(f"{file}: E_KEYS: expected a dict with hand_shape (10,).")
-    return to_array(shape["hand_shape"], NUM_BETAS, what=f"{file}: hand_shape")
-
-
-def _frame_order(key: object) -> tuple[int, str]:
-    """Time order of frame keys, with or without leading zeros."""
-    text = str(key)
-    return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
-
-
-def _stack(frames: list[tuple[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    rows = []
-    for where, frame in frames:
-        if not isinstance(frame, dict) or not {"hand_pose", "hand_trans"} <= set(frame):
-            raise DemoError(
-                f"{where}: E_KEYS: expected a dict with hand_pose (48,) and hand_trans "
-                f"(3,)."
-            )
-        pose = to_array(frame["hand_pose"], NUM_POSE, what=f"{where}: hand_pose")
-        wrist = to_array(frame["hand_trans"], 3, what=f"{where}: hand_trans")
-        rows.append(np.concatenate([pose, wrist]))
-    table = np.stack(rows)
-    return table[:, :NUM_POSE], table[:, NUM_POSE:]
-
-
 FPS = 30.0
 HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
 ROLES = ("tool", "target")
 MESH_SCALE = 0.01  # centimetres to metres
 MAX_TRIM = 2  # frames by which tracks of a sequence may differ in length
-# what np.load raises on bytes that are no array
-BROKEN = (OSError, ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile)
 LICENCE = "TACO, CC BY 4.0"
 
 
 @dataclass(frozen=True, kw_only=True)
 class TacoSequence:
-    """Where one sequence lies.
-
-    Attributes:
-        root: of the dataset.
-        folder: ``(verb, tool, target)/<sequence>``, below both folders of poses.
-        name: of the motion.
-        split: train, test_1 to test_4, or nothing.
-        meshes: file of each mesh id that the sequence names.
-        mano: folder of the hand model.
-    """
+    """Where one sequence lies."""
 
     root: Path
     folder: str
@@ -146,11 +74,7 @@ def mesh_id(pose_file: Path) -> str:
 
 
 def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
-    """One sequence as one motion.
-
-    Raises:
-        DemoError: a file is missing or wrong, or tracks differ in length.
-    """
+    """One sequence as one motion."""
     for file in sequence.files():
         refuse_pointer(file)
     notes: list[str] = []
@@ -164,7 +88,6 @@ def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
         name=sequence.name,
         fps=FPS,
         keypoints=keypoints,
-        palm={s: palm_frame(k, s) for s, k in keypoints.items()},
         objects=[DemoObject(b.name, b.mesh, b.pose[:frames]) for b in objects],
         source="taco",
         licence=LICENCE,
@@ -186,17 +109,59 @@ def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarr
     files = sequence.hand_files(side)
     if not files:
         raise DemoError(
-            f"{sequence.root / HANDS / sequence.folder}: E_FILE: no {side} hand. "
-            f"Expected {side}_hand.pkl, or {side}_hand/hand_*.pkl."
+            f"{sequence.root / HANDS / sequence.folder}: no {side} hand. "
+            f"Expected {side}_hand.pkl, or {side}_hand/hand_*.pkl.",
+            code="E_FILE",
         )
     shape_file = sequence.shape_file(side)
     if not shape_file.is_file():
         notes.append(f"W_SHAPE: no {shape_file.name}; the mean shape is used")
-    betas = read_shape(shape_file) if shape_file.is_file() else np.zeros(NUM_BETAS)
-    in_folder = files[0].parent.name == f"{side}_hand"
-    pose, wrist = read_frame_files(files) if in_folder else read_all_frames(files[0])
-    return load_mano(sequence.mano, side).keypoints(
-        rotations_from_axis_angle(pose), betas, wrist, convention="wrist"
+    betas = np.zeros(NUM_BETAS)
+    if shape_file.is_file():
+        stored = part(load_pickle(shape_file), "hand_shape", where=str(shape_file))
+        betas = to_array(stored, NUM_BETAS, what=f"{shape_file}: hand_shape")
+    if files[0].parent.name == f"{side}_hand":  # one file a frame
+        frames = [(str(file), load_pickle(file)) for file in files]
+    else:
+        frames = _all_frames(files[0])
+    table = np.stack([_frame_row(frame, where=where) for where, frame in frames])
+    return load_mano(sequence.mano, side).keypoints_of(
+        table[:, :3],
+        table[:, 3:NUM_POSE],
+        table[:, NUM_POSE:],
+        betas=betas,
+        convention="wrist",
+        where=str(files[0]),
+    )
+
+
+def _all_frames(file: Path) -> list[tuple[str, Any]]:
+    """Frames of a file that holds all, with their place; their keys sort in time."""
+    frames = load_pickle(file)
+    if not isinstance(frames, dict) or not frames:
+        raise DemoError(
+            f"{file}: holds a {type(frames).__name__}; expected a dict of frames, each "
+            f"with hand_pose and hand_trans.",
+            code="E_KEYS",
+        )
+    keys = sorted(frames, key=_frame_order)
+    return [(f"{file}, frame {key!r}", frames[key]) for key in keys]
+
+
+def _frame_order(key: object) -> tuple[int, str]:
+    """Time order of frame keys, with or without leading zeros."""
+    text = str(key)
+    return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
+
+
+def _frame_row(frame: Any, *, where: str) -> np.ndarray:
+    """Axis-angle, rad, then wrist position, m, (51,)."""
+    sizes = {"hand_pose": NUM_POSE, "hand_trans": 3}
+    return np.concatenate(
+        [
+            to_array(part(frame, key, where=where), size, what=f"{where}: {key}")
+            for key, size in sizes.items()
+        ]
     )
 
 
@@ -204,14 +169,16 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
     files = sequence.pose_files(role)
     if len(files) != 1:
         raise DemoError(
-            f"{sequence.root / OBJECTS / sequence.folder}: E_FILE: {len(files)} files "
-            f"{role}_<id>.npy; expected one."
+            f"{sequence.root / OBJECTS / sequence.folder}: {len(files)} files "
+            f"{role}_<id>.npy; expected one.",
+            code="E_FILE",
         )
     file, key = files[0], mesh_id(files[0])
     if key not in sequence.meshes:
         raise DemoError(
-            f"{file}: E_FILE: no mesh {key}_cm.obj in Object_Models. Download it, or "
-            f"name the folder of the meshes with --models."
+            f"{file}: no mesh {key}_cm.obj in Object_Models. Download it, or "
+            f"name the folder of the meshes with --models.",
+            code="E_FILE",
         )
     pose, found = poses_from_matrices(_load_matrices(file), what=str(file))
     notes += found
@@ -221,16 +188,9 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
 
 
 def _load_matrices(file: Path) -> np.ndarray:
-    try:
-        array = np.load(file, allow_pickle=False)
-    except BROKEN as error:
-        raise DemoError(
-            f"{file}: E_KEYS: not a .npy of plain numbers: {error}. Expected (T, 4, 4) "
-            f"floats; pickled arrays are not read."
-        ) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise DemoError(f"{file}: E_KEYS: expected one array of (T, 4, 4) floats.")
-    return array
+    fault = "not a .npy of (T, 4, 4) floats; pickled arrays are not read"
+    with told(file, fault, code="E_KEYS"):
+        return numbers(np.load(file, allow_pickle=False), what=f"{file}: (T, 4, 4)")
 
 
 def _common_length(
@@ -246,8 +206,9 @@ def _common_length(
     counts = ", ".join(f"{name} {count}" for name, count in lengths.items())
     if longest - shortest > MAX_TRIM:
         raise DemoError(
-            f"{sequence.folder}: E_LEN: frames differ: {counts}. At most {MAX_TRIM} "
-            f"may be missing at the end. Download the sequence again."
+            f"{sequence.folder}: frames differ: {counts}. At most {MAX_TRIM} "
+            f"may be missing at the end. Download the sequence again.",
+            code="E_LEN",
         )
     if longest > shortest:
         notes.append(f"E_LEN: trimmed to {shortest} frames: {counts}")

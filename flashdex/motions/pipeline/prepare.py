@@ -36,7 +36,7 @@ PACKAGES = ("torch", "mujoco", "trimesh", "coacd", "numpy", "scipy")
 class Order:
     """What is to be prepared, and how."""
 
-    source: str  # name of a reader, see ``flashdex.datasets.SOURCES``
+    source: str  # name of a reader, see ``flashdex.datasets.source_names``
     options: SourceOptions = field(default_factory=SourceOptions)
     settings: MotionSettings = field(default_factory=MotionSettings)
 

@@ -25,7 +25,7 @@ LIMITS = {
 # docs/data.md says the same at more length; a test compares the codes
 CODES = {
     "E_CRASH": "preparing it ended in an unforeseen fault",
-    "E_DEMO": "unusable: shapes, NaN, quaternions, too few frames",
+    "E_DEMO": "unusable otherwise: NaN, quaternions, too few frames",
     "E_FILE": "files that belong together are missing",
     "E_KEYS": "a key is missing or has a wrong shape",
     "E_LEN": "hands and objects have different numbers of frames",

@@ -1,0 +1,211 @@
+"""Opens the files of datasets; whatever is wrong with one becomes one clear message."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import pickle
+import re
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from flashdex.datasets.pickles import MAX_BYTES, RefusedError, check_sizes, unpickle
+from flashdex.errors import DemoError
+
+POINTER_START = b"version https://git-lfs"
+POINTER_SIZE = 200  # bytes; a pointer holds three short lines
+# what is raised by content of another layout, or nested too deep
+BROKEN = (
+    *(ValueError, TypeError, LookupError, AttributeError),
+    *(OverflowError, RecursionError),
+)
+
+
+def refuse_pointer(file: Path) -> None:
+    """Refuse a Git-LFS pointer, which stands where the file should be.
+
+    Raises:
+        DemoError: the file is a pointer, or no file at all but a folder, a pipe, a
+            device or a broken link.
+        FileNotFoundError: there is nothing.
+    """
+    if not file.is_file() and (file.exists() or file.is_symlink()):
+        raise DemoError(
+            f"{file}: cannot be read: not a file but a folder, a pipe, a device or a "
+            f"broken link. Put the file itself there.",
+            code="E_FILE",
+        )
+    if file.stat().st_size >= POINTER_SIZE:
+        return
+    with file.open("rb") as stream:
+        start = stream.read(len(POINTER_START))
+    if start == POINTER_START:
+        raise DemoError(
+            f"{file}: a Git-LFS pointer, not the file itself. Download the content: "
+            f"git lfs pull, or the dataset's own tool.",
+            code="E_ROOT",
+        )
+
+
+def refuse_clone(files: Iterable[Path]) -> None:
+    """Refuse a clone whose content was not fetched: its first files are pointers.
+
+    Whatever else is wrong with a file costs its own recording only, when it is read.
+    """
+    for file in files:
+        if file.is_file():
+            refuse_pointer(file)
+
+
+@contextmanager
+def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[None]:
+    """Turns what content of another layout raises into one message.
+
+    Args:
+        where: file, and place in it.
+        fault: what it is not, and what to do.
+        code: of the error.
+    """
+    try:
+        yield
+    except OSError as error:
+        text = f"{where}: cannot be read: {error.strerror or error}."
+        raise DemoError(text, code="E_FILE") from error
+    except BROKEN as error:
+        shown = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise DemoError(f"{where}: {fault}: {shown}.", code=code) from error
+
+
+def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
+    """The content of a JSON file; ``fault`` says of another file what it is not."""
+    with told(file, fault, code=code):
+        refuse_pointer(file)
+        return json.loads(file.read_text(encoding="utf-8"))
+
+
+def load_pickle(path: Path) -> Any:
+    """The content of a pickle, see ``unpickle``.
+
+    Raises:
+        DemoError: the file is missing, damaged, or asks for what is not data.
+    """
+    return _open(path, "pickle", lambda file: unpickle(io.BytesIO(file.read())))
+
+
+def load_npy(path: Path) -> Any:
+    """The array of a ``.npy`` file, or the only element of one without dimensions."""
+    return _open(path, ".npy array", lambda file: _read_array(file.read()))
+
+
+def load_npz(
+    path: Path, *, only: Collection[str] | None = None, plain: bool = False
+) -> dict[str, Any]:
+    """Entries of a ``.npz`` file, each as ``load_npy`` gives it.
+
+    Args:
+        path: the file.
+        only: names of the entries that are wanted, as far as they are there.
+        plain: refuse entries that hold objects.
+    """
+    kind = ".npz without pickles" if plain else ".npz archive"
+    entries = _open(path, kind, partial(_read_npz, only=only))
+    for name, array in entries.items():
+        if plain and (not isinstance(array, np.ndarray) or array.dtype.kind == "O"):
+            raise DemoError(
+                f"{path}: not a readable {kind}: '{name}' holds objects. Store plain "
+                f"arrays; text as np.array([...], dtype=str)."
+            )
+    return entries
+
+
+def load_torch(path: Path) -> Any:
+    """The content of a file of ``torch.save``: tensors on the CPU, plain containers."""
+    return _open(path, "torch file", _read_torch)
+
+
+def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
+    try:
+        refuse_pointer(path)
+        with path.open("rb") as file:
+            return read(file)
+    except DemoError:
+        raise
+    except RefusedError as error:
+        raise DemoError(
+            f"{path}: it tried to load {error}, which is not data, so it was not read. "
+            f"Don't open it with anything else; get the file anew from where the "
+            f"dataset is published.",
+            code="E_PICKLE",
+        ) from error
+    except OSError as error:
+        raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
+    # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
+    except Exception as error:
+        told = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DemoError(
+            f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "
+            f"of another kind; unpack or download it anew."
+        ) from error
+
+
+def _read_array(data: bytes) -> Any:
+    """An array of .npy bytes."""
+    file = io.BytesIO(data)
+    version = "_".join(map(str, np.lib.format.read_magic(file)))
+    shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(
+        file
+    )
+    if dtype.kind == "O":
+        array = unpickle(file)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
+            raise ValueError("an object array that holds something else")
+        return array.item() if array.ndim == 0 else array
+    count = math.prod(check_sizes(shape))
+    if dtype.hasobject or count * dtype.itemsize > len(data):
+        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
+    raw = bytearray(file.read(count * dtype.itemsize))
+    return np.frombuffer(raw, dtype, count).reshape(
+        shape, order="F" if by_columns else "C"
+    )
+
+
+def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
+    with zipfile.ZipFile(file) as archive:
+        _check_size(archive)
+        files = [name for name in archive.namelist() if name.endswith(".npy")]
+        if not files:
+            raise ValueError("it holds no .npy entries")
+        names = {name.removesuffix(".npy"): name for name in files}
+        wanted = {k: v for k, v in names.items() if only is None or k in only}
+        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
+
+
+def _check_size(archive: zipfile.ZipFile) -> None:
+    size = sum(member.file_size for member in archive.infolist())
+    if size > MAX_BYTES:
+        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
+
+
+def _read_torch(file: IO[bytes]) -> Any:
+    import torch  # slow to import, and few readers need it
+
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            _check_size(archive)
+    file.seek(0)
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        found = re.search(r"GLOBAL ([\w.]+)", str(error))
+        if found is None:
+            # torch's own text advises to read such a file without care
+            text = "it is torn, or holds more than tensors in plain containers"
+            raise ValueError(text) from error
+        raise RefusedError(found.group(1)) from error

@@ -28,7 +28,7 @@ def flop_of(batch: int) -> float:
         batch: rows B.
     """
     size = replace(SIZES["paper"], batch=batch)
-    stepper, td = FlashSACStepper(make_loss(size)), make_batch(size)[0]
+    stepper, td = FlashSACStepper(make_loss(size)), make_batch(size)
     stepper.update(td)  # the first one makes the optimisers' state
     stepper.update(td)
     pair = count_products(lambda: (stepper.update(td), stepper.update(td)))

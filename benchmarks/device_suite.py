@@ -14,21 +14,158 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from benchmarks.suite_parts import PARTS, Choice, Job, jobs_of
+from flashdex.system.jsonl import append_line
 
 ROOT = Path(__file__).resolve().parent.parent
+RECIPE = "bench50_xhand"  # the paper's settings
+CURVE_LIBRARY = "procedural50"
+FEW_WORLDS = "env.attempt_share=0.5"  # of a handful there must be one
 MESSAGE_LINES = 20
 LEAST_S = 20.0  # less time than this is not worth a start
 POLL_S = 0.5
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command: a module and its words.
+
+    Attributes:
+        name: in the lines of results.
+        words: after `python -m`.
+        limit_s: it is stopped after that many seconds.
+        watch: file of JSON lines that grows while it runs, or None.
+    """
+
+    name: str
+    words: list[str]
+    limit_s: float
+    watch: Path | None = None
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a call of the suite asks for.
+
+    Attributes:
+        engine: of the physics.
+        libraries: folder of the prepared libraries.
+        tiny: sizes that show on any computer that the commands work.
+        minutes: of the whole call.
+        overrides: ``key=value`` changes of the recipe, last.
+        scratch: folder for runs.
+    """
+
+    engine: str
+    libraries: Path
+    tiny: bool
+    minutes: float
+    overrides: list[str]
+    scratch: Path
+
+    def scene(self, objects: int, hulls: int, worlds: int | None = None) -> list[str]:
+        """Words that choose recipe and scene."""
+        words = ["--recipe", RECIPE, "--libraries", str(self.libraries)]
+        words += ["--objects", str(objects), "--hulls", str(hulls)]
+        return words if worlds is None else [*words, "--num-envs", str(worlds)]
+
+
+def _env(choice: Choice) -> Iterator[Job]:
+    worlds = (8, 16) if choice.tiny else (4096, 8192, 2048, 16384, 1024)
+    sizes = [(2, 16, n) for n in worlds]
+    if not choice.tiny:
+        sizes += [(2, 1, 4096), (2, 4, 4096), (2, 8, 4096), (1, 16, 4096), (1, 1, 4096)]
+    # compiling would be most of a job's time; the full loop has it
+    words = ["--seconds", "0.5" if choice.tiny else "8", f"physics={choice.engine}"]
+    words += ["env.compile=false", *[FEW_WORLDS] * choice.tiny, *choice.overrides]
+    for size in sizes:
+        name = "env o{} h{} n{}".format(*size)
+        yield Job(name, ["benchmarks.env", *choice.scene(*size), *words], 180)
+
+
+def _train(choice: Choice) -> Iterator[Job]:
+    words = ["--seconds", "2" if choice.tiny else "40", "--ceiling-seconds"]
+    words += ["0.5" if choice.tiny else "6", f"physics={choice.engine}"]
+    if choice.tiny:
+        words += ["algo.batch_size=64", "algo.critic_width=16", "algo.actor_width=16"]
+        words += ["algo.buffer_size=2000", "algo.compile=false", "env.compile=false"]
+        words.append(FEW_WORLDS)
+    else:
+        words.append("algo.bfloat16=true")
+    for n in (8,) if choice.tiny else (4096, 8192, 2048):
+        scene = choice.scene(2, 16, n)
+        command = ["benchmarks.train", *scene, *words, *choice.overrides]
+        yield Job(f"train n{n}", command, 300)
+
+
+def _learner(choice: Choice) -> Iterator[Job]:
+    words = ["benchmarks.learner", "--sizes", "tiny" if choice.tiny else "paper"]
+    words += ["--device", "auto", "--rounds", "2" if choice.tiny else "10"]
+    fast = [*words, "--precision", "high", "--autocast"]
+    yield Job("learner tf32 bfloat16", fast, 240)
+    if not choice.tiny:
+        yield Job("learner compiled", [*fast, "--compile"], 420)
+        yield Job("learner float32", words, 240)
+
+
+def _replay(choice: Choice) -> Iterator[Job]:
+    sizes = [("auto", "20k"), ("cpu", "20k")]
+    if not choice.tiny:
+        sizes = [("device", "50M"), ("pinned", "50M"), ("device", "1M")]
+        sizes += [("device", "10M"), ("pinned", "10M"), ("cpu", "1M")]
+    words = ["benchmarks.replay", *choice.scene(2, 1)]
+    if choice.tiny:
+        words += ["--batch", "64", "--seconds", "0.2", "algo.compile=false"]
+    # its rows are what is wanted of the environment
+    words += ["env.compile=false", *choice.overrides]
+    for place, rows in sizes:
+        command = [*words, "--replay", place, "--rows", rows]
+        yield Job(f"replay {place} {rows}", command, 240)
+
+
+def _curve(choice: Choice) -> Iterator[Job]:
+    run = choice.scratch / "curve"
+    # the rest of the call is for building the scenes and the last checkpoint
+    limit = max(0.5, choice.minutes - (0.2 if choice.tiny else 1.5)) * 60
+    words = ["flashdex.cli.main", "train", RECIPE, f"run_dir={run}"]
+    words.append(f"motions.library={choice.libraries / CURVE_LIBRARY}")
+    words += [f"physics={choice.engine}", f"train.wall_limit_s={limit:g}"]
+    words += ["train.render_conversions=false", "train.checkpoint_every_s=100000"]
+    if choice.tiny:
+        words += ["env.num_envs=8", "algo.batch_size=32", "algo.critic_width=16"]
+        words += ["motions.count=1", "algo.buffer_size=2000", "algo.min_buffer=64"]
+        words += ["algo.compile=false", "env.compile=false", "total_env_steps=160"]
+        words.append(FEW_WORLDS)
+    else:
+        words += ["env.num_envs=4096", "total_env_steps=30_000_000"]
+        words.append("algo.bfloat16=true")
+    words += choice.overrides
+    yield Job("curve", words, 60 * choice.minutes, run / "metrics.jsonl")
+
+
+PARTS = {
+    "env": _env,
+    "train": _train,
+    "learner": _learner,
+    "replay": _replay,
+    "curve": _curve,
+}
+
+
+def jobs_of(part: str, choice: Choice) -> list[Job]:
+    """The jobs of one of the `PARTS`, most important first."""
+    return list(PARTS[part](choice))
 
 
 class Lines:
@@ -47,10 +184,7 @@ class Lines:
     def write(self, job: Job, found: dict[str, Any], **more: Any) -> None:
         """Append one line, on disk when this returns."""
         suite = {"part": self.part, "job": job.name, **more}
-        with self.out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**found, "suite": suite}) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(self.out, {**found, "suite": suite})
         self.results += "failed" not in found
         print(f"{self.part}: {job.name}: {_brief(found)}", flush=True)
 
@@ -66,26 +200,6 @@ def _brief(found: dict[str, Any]) -> str:
     return ", ".join(f"{k} {found[k]}" for k in names if k in found)
 
 
-class Watched:
-    """New lines of a file that a running job appends to.
-
-    Args:
-        path: the file, existing or not; None is no file.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self.path, self.read = path, 0
-
-    def new(self) -> list[dict[str, Any]]:
-        """Whole lines that were not there before."""
-        if self.path is None or not self.path.is_file():
-            return []
-        text = self.path.read_bytes()
-        end = text.rfind(b"\n") + 1
-        fresh, self.read = text[self.read : end], max(self.read, end)
-        return parse_lines(fresh.decode("utf-8", errors="replace"))
-
-
 def parse_lines(text: str) -> list[dict[str, Any]]:
     """The JSON objects among the lines of a text."""
     found = []
@@ -99,6 +213,27 @@ def parse_lines(text: str) -> list[dict[str, Any]]:
     return found
 
 
+class _Curve:
+    """The records of a running job, written as they come; half a line waits."""
+
+    def __init__(self, job: Job, lines: Lines) -> None:
+        self.job, self.lines, self.read = job, lines, 0
+
+    def write_new(self) -> None:
+        path = self.job.watch
+        if path is None or not path.is_file():
+            return
+        text = path.read_bytes()
+        end = text.rfind(b"\n") + 1
+        fresh, self.read = text[self.read : end], max(self.read, end)
+        kept = ("env_steps", "hours", "updates", "perf/env_steps_per_s")
+        for record in parse_lines(fresh.decode("utf-8", errors="replace")):
+            curve = {
+                k: v for k, v in record.items() if k in kept or k.startswith("convert/")
+            }
+            self.lines.write(self.job, {"benchmark": "curve", **curve})
+
+
 def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
     """Run one job to its end or its limit, and write what it has found.
 
@@ -109,7 +244,7 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
         scratch: working folder.
     """
     begin, why = time.monotonic(), ""
-    watched = Watched(job.watch)
+    curve = _Curve(job, lines)
     with (
         (scratch / "stdout").open("w+b") as stdout,
         (scratch / "stderr").open("w+b") as stderr,
@@ -120,7 +255,7 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
                 if time.monotonic() - begin > limit_s:
                     why = f"stopped after {limit_s:.0f} s"
                     break
-                _write_curve(job, lines, watched)
+                curve.write_new()
                 time.sleep(POLL_S)
         finally:
             stop(process)
@@ -128,20 +263,11 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
             results = parse_lines(_text(stdout))
             for found in results:
                 lines.write(job, found, seconds=spent)
-            _write_curve(job, lines, watched)
+            curve.write_new()
             if process.returncode and not why:
                 why = f"exit code {process.returncode}"
             if why or (not results and job.watch is None):
                 lines.fail(job, why or "no result", _text(stderr), seconds=spent)
-
-
-def _write_curve(job: Job, lines: Lines, watched: Watched) -> None:
-    for record in watched.new():
-        kept = ("env_steps", "hours", "updates", "perf/env_steps_per_s")
-        curve = {
-            k: v for k, v in record.items() if k in kept or k.startswith("convert/")
-        }
-        lines.write(job, {"benchmark": "curve", **curve})
 
 
 def start(words: list[str], scratch: Path, **streams: Any) -> subprocess.Popen[bytes]:
@@ -166,12 +292,11 @@ def stop(process: subprocess.Popen[bytes], *, patience_s: float = 5.0) -> None:
     for number in (signal.SIGTERM, signal.SIGKILL):
         try:
             os.killpg(process.pid, number)
-        except ProcessLookupError:
-            break
-        try:
             process.wait(patience_s)
         except subprocess.TimeoutExpired:
             continue
+        except ProcessLookupError:
+            pass
         break
     process.wait()
 
@@ -182,13 +307,7 @@ def _text(stream: Any) -> str:
 
 
 def run_part(part: str, choice: Choice, lines: Lines) -> None:
-    """Run the jobs of a part one after the other until the time is up.
-
-    Args:
-        part: one of `PARTS`.
-        choice: what the call asks for.
-        lines: where results go.
-    """
+    """Run the jobs of a part one after the other until the time is up."""
     end = time.monotonic() + 60 * choice.minutes
     for job in jobs_of(part, choice):
         left = end - time.monotonic()
@@ -199,32 +318,39 @@ def run_part(part: str, choice: Choice, lines: Lines) -> None:
         run_job(job, lines, limit_s=limit, scratch=choice.scratch)
 
 
+def unpack(source: Path, folder: Path) -> Path:
+    """The folder of the libraries: as given, or an archive unpacked into another."""
+    if source.is_dir():
+        return source.resolve()
+    shutil.unpack_archive(source, folder, filter="data")
+    return folder.resolve()
+
+
 def _interrupted(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
 def main() -> None:
     """Parse, unpack the libraries, run."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--part", choices=PARTS, required=True)
-    parser.add_argument("--minutes", type=float, default=9.0, help="of the whole call")
-    parser.add_argument("--out", type=Path, required=True, help="file of JSON lines")
-    parser.add_argument(
-        "--libraries", type=Path, required=True, help="folder or archive"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--engine", default="warp", choices=["warp", "cpu", "brax"])
-    parser.add_argument("--tiny", action="store_true", help="only try the commands")
-    parser.add_argument("overrides", nargs="*", metavar="key=value")
+    add = parser.add_argument
+    add("--part", choices=PARTS, required=True)
+    add("--minutes", type=float, default=9.0, help="of the whole call")
+    add("--out", type=Path, required=True, help="file of JSON lines")
+    add("--libraries", type=Path, required=True, help="folder or archive")
+    add("--engine", default="warp", choices=["warp", "cpu", "brax"])
+    add("--tiny", action="store_true", help="only try the commands")
+    add("overrides", nargs="*", metavar="key=value")
     args = parser.parse_intermixed_args()
     if not args.libraries.exists():
         parser.error(
-            f"--libraries: {args.libraries} does not exist. Make it: python "
-            "benchmarks/suite_libraries.py libraries/suite --pack suite.tar.xz"
+            f"--libraries: {args.libraries} does not exist. Make it: python -m "
+            "benchmarks.suite_libraries libraries/suite --pack suite.tar.xz"
         )
     signal.signal(signal.SIGTERM, _interrupted)
     with tempfile.TemporaryDirectory(prefix="flashdex-suite-") as folder:
-        from benchmarks.suite_libraries import unpack
-
         scratch = Path(folder)
         choice = Choice(
             engine=args.engine,

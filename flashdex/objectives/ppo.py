@@ -29,14 +29,7 @@ METRICS = (
 
 
 def bootstrap_rows(done: Tensor) -> Tensor:
-    """Rows of a rollout whose next state is not the next row: ends and the last step.
-
-    Args:
-        done: (N, T) bool.
-
-    Returns:
-        (N, T) bool.
-    """
+    """Rows (N, T) whose next state is not the next row: ends and the last step."""
     rows = done.clone()
     rows[:, -1] = True
     return rows
@@ -228,16 +221,15 @@ class PPO:
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        values = (
-            out["loss_objective"],
-            out["loss_critic"],
-            out["entropy"],
-            kl,
-            out["clip_fraction"],
-            out["explained_variance"],
-            norm,
-        )
-        return dict(zip(METRICS, values, strict=True))
+        return {
+            "loss_policy": out["loss_objective"],
+            "loss_value": out["loss_critic"],
+            "entropy": out["entropy"],
+            "kl": kl,
+            "ratio_clipped": out["clip_fraction"],
+            "explained_variance": out["explained_variance"],
+            "gradient_norm": norm,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Networks and optimiser; the generator belongs to the caller."""

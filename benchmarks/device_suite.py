@@ -39,40 +39,24 @@ POLL_S = 0.5
 
 @dataclass(frozen=True)
 class Job:
-    """One command: a module and its words.
+    """One command: a module and its words."""
 
-    Attributes:
-        name: in the lines of results.
-        words: after `python -m`.
-        limit_s: it is stopped after that many seconds.
-        watch: file of JSON lines that grows while it runs, or None.
-    """
-
-    name: str
-    words: list[str]
-    limit_s: float
-    watch: Path | None = None
+    name: str  # in the lines of results
+    words: list[str]  # after `python -m`
+    limit_s: float  # it is stopped after that many seconds
+    watch: Path | None = None  # file of JSON lines that grows while it runs
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a call of the suite asks for.
+    """What a call of the suite asks for."""
 
-    Attributes:
-        engine: of the physics.
-        libraries: folder of the prepared libraries.
-        tiny: sizes that show on any computer that the commands work.
-        minutes: of the whole call.
-        overrides: ``key=value`` changes of the recipe, last.
-        scratch: folder for runs.
-    """
-
-    engine: str
-    libraries: Path
-    tiny: bool
-    minutes: float
-    overrides: list[str]
-    scratch: Path
+    engine: str  # of the physics
+    libraries: Path  # folder of the prepared libraries
+    tiny: bool  # sizes that show on any computer that the commands work
+    minutes: float  # of the whole call
+    overrides: list[str]  # ``key=value`` changes of the recipe, last
+    scratch: Path  # folder for runs
 
     def scene(self, objects: int, hulls: int, worlds: int | None = None) -> list[str]:
         """Words that choose recipe and scene."""
@@ -154,13 +138,8 @@ def _curve(choice: Choice) -> Iterator[Job]:
     yield Job("curve", words, 60 * choice.minutes, run / "metrics.jsonl")
 
 
-PARTS = {
-    "env": _env,
-    "train": _train,
-    "learner": _learner,
-    "replay": _replay,
-    "curve": _curve,
-}
+_MAKERS = (_env, _train, _learner, _replay, _curve)
+PARTS = {make.__name__.removeprefix("_"): make for make in _MAKERS}
 
 
 def jobs_of(part: str, choice: Choice) -> list[Job]:
@@ -169,12 +148,7 @@ def jobs_of(part: str, choice: Choice) -> list[Job]:
 
 
 class Lines:
-    """Appends results to a file, each with the job it comes from.
-
-    Args:
-        out: file of JSON lines.
-        part: of the suite.
-    """
+    """Appends results to a file of JSON lines, each with the job it comes from."""
 
     def __init__(self, out: Path, part: str) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -235,14 +209,7 @@ class _Curve:
 
 
 def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
-    """Run one job to its end or its limit, and write what it has found.
-
-    Args:
-        job: the command.
-        lines: where results go.
-        limit_s: seconds after which it is stopped.
-        scratch: working folder.
-    """
+    """Run one job to its end or its limit, and write what it has found."""
     begin, why = time.monotonic(), ""
     curve = _Curve(job, lines)
     with (
@@ -271,13 +238,7 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
 
 
 def start(words: list[str], scratch: Path, **streams: Any) -> subprocess.Popen[bytes]:
-    """Begin a command in a process group of its own.
-
-    Args:
-        words: after `python -m`.
-        scratch: working folder.
-        streams: of the process.
-    """
+    """Begin a command in a process group of its own."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path.rstrip(os.pathsep)}
     env |= {"WANDB_MODE": "offline", "PYTHONUNBUFFERED": "1"}

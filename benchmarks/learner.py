@@ -84,25 +84,17 @@ NORMAL_SIZES = ("quickstart", "b512", "b2048")
 
 def make_loss(size: LearnerSize) -> FlashSACLoss:
     """The library's networks and objective, fresh."""
+    window = {"num_frames": FRAMES, "latent_dim": size.latent, "widths": size.channels}
 
-    def encoder(ensemble: int) -> FutureEncoder | None:
-        if not size.future:
-            return None
-        return FutureEncoder(
-            size.future,
-            num_frames=FRAMES,
-            latent_dim=size.latent,
-            widths=size.channels,
-            ensemble=ensemble,
-        )
+    def options(width: int, ensemble: int) -> dict[str, Any]:
+        encoder = None
+        if size.future:
+            encoder = FutureEncoder(size.future, ensemble=ensemble, **window)
+        return {"num_groups": count, "width": width, "future_encoder": encoder}
 
     count, shape = size.groups, (size.observation, size.action)
-    actor = FlashActor(
-        *shape, num_groups=count, width=size.actor, future_encoder=encoder(count)
-    )
-    critic = EnsembleCritic(
-        *shape, num_groups=count, width=size.critic, future_encoder=encoder(1)
-    )
+    actor = FlashActor(*shape, **options(size.actor, count))
+    critic = EnsembleCritic(*shape, **options(size.critic, 1))
     groups = [f"group{g}" for g in range(count)]
     return FlashSACLoss(actor, critic, groups=groups, gamma=GAMMA, n_steps=N_STEPS)
 

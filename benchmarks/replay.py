@@ -61,17 +61,9 @@ def main(words: Sequence[str] = ()) -> list[dict[str, Any]]:
 
 
 def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
-    """Fill the ring of a recipe and sample from it.
+    """Rows a second, bytes a row, shares of the ceilings; ``algo`` says of what.
 
-    Args:
-        recipe: physics on the cpu, small networks; ``algo`` says what is measured.
-        seconds: for each figure but the filling.
-
-    Returns:
-        Rows a second, bytes a row, shares of the ceilings.
-
-    Raises:
-        FlashdexError: the rows do not fit into memory.
+    Each figure but the filling takes some seconds.
     """
     bench = open_workbench(recipe)
     learner = bench.make_learner(env := bench.make_env())

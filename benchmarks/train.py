@@ -27,6 +27,7 @@ from flashdex.training.build import open_workbench
 from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too
+COPIED = ("updates_per_step", "bfloat16", "compile", "replay")  # of the algorithm
 # No certificates, films or checkpoints, an actor that steps from the start, and a loop
 # that learns from the first batches on.
 CHANGES = (
@@ -62,15 +63,9 @@ def main(words: Sequence[str] = ()) -> dict[str, Any]:
 def measure(
     recipe: Recipe, *, seconds: float, ceiling_seconds: float
 ) -> dict[str, Any]:
-    """Build a trainer as a run does and drive its vector step.
+    """Build a trainer of an off-policy learner as a run does; drive its vector step.
 
-    Args:
-        recipe: of an off-policy learner.
-        seconds: of the loop.
-        ceiling_seconds: of each part alone, before and after.
-
-    Returns:
-        Rates, milliseconds of the phases, shares of the ceilings, memory.
+    Each part alone is measured before and after.
     """
     with _open_trainer(recipe) as (trainer, described, built):
         device = trainer.learner.device
@@ -95,10 +90,7 @@ def measure(
         **described,
         "batch": recipe.algo.batch_size,
         "critic": recipe.algo.critic_width,
-        "updates_per_step": recipe.algo.updates_per_step,
-        "bfloat16": recipe.algo.bfloat16,
-        "compile": recipe.algo.compile,
-        "replay": recipe.algo.replay,
+        **{name: getattr(recipe.algo, name) for name in COPIED},
         **loop,
         "ceiling_physics_env_steps_per_s": round(physics, 1),
         "ceiling_updates_per_s": round(learner, 2),

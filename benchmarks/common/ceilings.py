@@ -25,10 +25,6 @@ def seconds_each(call: Callable[[], object], *, seconds: float) -> float:
     """Seconds of one call, from as many calls as fit into some seconds.
 
     The first calls are not counted, and a GPU is waited for after blocks of calls only.
-
-    Args:
-        call: what is measured.
-        seconds: how long to measure, at least one block of calls.
     """
     threads = torch.get_num_threads()
     clock = Timer("call()", globals={"call": call}, num_threads=threads)
@@ -37,9 +33,6 @@ def seconds_each(call: Callable[[], object], *, seconds: float) -> float:
 
 def memory_gb(device: torch.device) -> dict[str, float]:
     """Memory in GB (1e9 bytes): the host's peak, torch's peak, all of the device.
-
-    Args:
-        device: where torch allocates.
 
     Returns:
         ``host_peak``; on a GPU also ``torch_peak`` and ``device_used``, which is what
@@ -85,15 +78,7 @@ def matmul_gflops(device: torch.device, dtype: torch.dtype, *, seconds: float) -
 
 
 def matmul_ceilings(device: torch.device, *, seconds: float = 0.5) -> dict[str, float]:
-    """Rates of the number formats a learner may use, GFLOP/s.
-
-    Args:
-        device: where.
-        seconds: for each format and size.
-
-    Returns:
-        ``float32`` and ``bfloat16``, on a GPU also ``tf32``.
-    """
+    """GFLOP/s of ``float32`` and ``bfloat16`` products, on a GPU also ``tf32``."""
     with float32_products("highest"):
         rates = {"float32": matmul_gflops(device, torch.float32, seconds=seconds)}
     if device.type == "cuda":
@@ -112,15 +97,9 @@ def gather_seconds(
     device: torch.device,
     seconds: float,
 ) -> float:
-    """Seconds to gather random rows of one wide table and have them on the device.
+    """Seconds to gather a batch of random rows of one table and have them on a device.
 
-    Args:
-        rows: of the table; all of them are written first.
-        width: bytes of a row.
-        batch: rows gathered.
-        kept_on: where the table lies.
-        device: where the rows are wanted.
-        seconds: how long to measure.
+    The table of so many rows, each ``width`` bytes, is written first.
     """
     # gathers move whole numbers: eight bytes each
     table = torch.ones(rows, -(-width // 8), dtype=torch.int64, device=kept_on)
@@ -135,13 +114,7 @@ def gather_seconds(
 def copy_gb_per_s(
     device: torch.device, *, num_bytes: int, seconds: float = 0.5
 ) -> float:
-    """Bytes read plus bytes written by a plain copy, GB/s.
-
-    Args:
-        device: where.
-        num_bytes: of the tensor; several times the largest cache.
-        seconds: how long to measure.
-    """
+    """Bytes read plus bytes written by a plain copy of so many bytes, GB/s."""
     source = torch.ones(num_bytes // 8, dtype=torch.int64, device=device)
     target = torch.empty_like(source)
     each = seconds_each(lambda: target.copy_(source), seconds=seconds)
@@ -165,12 +138,7 @@ class Product(NamedTuple):
 def count_products(
     call: Callable[[], object], *, repeat: int = 1
 ) -> dict[Product, float]:
-    """How often each product runs in one call, gradients included.
-
-    Args:
-        call: what to look at.
-        repeat: calls.
-    """
+    """How often each product runs in one call, gradients included; mean of some."""
     counts: Counter[Product] = Counter()
 
     def of(first: int, *, columns: int = -1) -> Callable[..., int]:
@@ -204,11 +172,7 @@ def replay_seconds(
 ) -> float:
     """Seconds that the products of one call take by themselves, each in a tight loop.
 
-    Args:
-        counts: the products.
-        repeat: runs of each product; the median counts. On a GPU they run in one row,
-            and the mean counts.
-        device: where.
+    The median of ``repeat`` runs counts; on a GPU they run in one row, and the mean.
     """
     device, total = torch.device(device), 0.0
     in_a_row = 1 if device.type == "cpu" else 10 * repeat

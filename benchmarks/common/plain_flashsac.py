@@ -50,10 +50,7 @@ class PlainBlock(nn.Module):
 class PlainEncoder(nn.Module):
     """Three temporal convolutions with SiLU and a linear read-out: (B, C, K) to (B, d).
 
-    Args:
-        sizes: channels C and widths of the convolutions, four numbers.
-        inputs: of the read-out, frames times channels.
-        latent: its outputs d.
+    The sizes are the channels C and the widths of the convolutions.
     """
 
     def __init__(self, sizes: Sequence[int], inputs: int, latent: int) -> None:
@@ -72,13 +69,8 @@ class PlainEncoder(nn.Module):
 class PlainNetworks(nn.Module):
     """Separate networks that see the same observation and encoded window.
 
-    Each is BatchNorm, linear map, blocks, RMSNorm and head.
-
-    Args:
-        source: stacked networks whose weights are copied.
-        members: which of them.
-        encoder: member of the source's encoder, if it has one.
-        unit_heads: the heads' rows are projected, too.
+    Each is BatchNorm, linear map, blocks, RMSNorm and head, copied from a member of
+    stacked networks, as is the encoder; unit heads are projected, too.
     """
 
     def __init__(
@@ -154,29 +146,17 @@ def _copy_encoder(source: FutureEncoder, member: int) -> PlainEncoder:
 
 @dataclass(frozen=True)
 class PlainBatch:
-    """B transitions as one would lay them out for this learner.
+    """B transitions as one would lay them out for this learner."""
 
-    Attributes:
-        observation: (B, D).
-        next_observation: (B, D).
-        future: (B, C, K), or None.
-        next_future: (B, C, K), or None.
-        action: joint action, (B, G A).
-        reward: one (B,) a group.
-        discount: gamma^k, (B,).
-        terminated: 0 or 1, (B,).
-        valid: rows in which a group takes part, one list a group; None is all.
-    """
-
-    observation: Tensor
+    observation: Tensor  # (B, D)
     next_observation: Tensor
-    future: Tensor | None
+    future: Tensor | None  # (B, C, K)
     next_future: Tensor | None
-    action: Tensor
-    reward: list[Tensor]
-    discount: Tensor
-    terminated: Tensor
-    valid: list[Tensor] | None
+    action: Tensor  # joint action, (B, G A)
+    reward: list[Tensor]  # one (B,) a group
+    discount: Tensor  # gamma^k, (B,)
+    terminated: Tensor  # 0 or 1, (B,)
+    valid: list[Tensor] | None  # rows in which each group takes part; None is all
 
     def both(self) -> tuple[Tensor, Tensor | None]:
         """Rows of s above those of s': observations (2B, D), windows (2B, C, K)."""
@@ -187,18 +167,13 @@ class PlainBatch:
 
 
 def read_batch(td: TensorDictBase, loss: FlashSACLoss) -> PlainBatch:
-    """What the plain learner reads, from the rows and not through the package.
-
-    Args:
-        td: sampled batch, (B,).
-        loss: whose groups, discount and window are meant.
-    """
-    after = td["next"]
+    """What the plain learner reads of a batch, not through the package."""
+    after = td.get("next")
     groups = [() if group is None else (group,) for group in loss.groups]
     steps = td.get("steps", torch.full((len(td),), loss.n_steps)).flatten()
     has_future = loss.qvalue_network.future_encoder is not None
     mask = td.get("group_mask", None)
-    observation = td["observation"]
+    observation = td.get("observation")
     return PlainBatch(
         observation=observation,
         next_observation=after["observation"],

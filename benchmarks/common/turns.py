@@ -80,11 +80,7 @@ class Turns:
 
     @torch.no_grad()
     def replay(self, told: list[Any]) -> float:
-        """Seconds of the engine alone under the given targets, after a reset.
-
-        Args:
-            told: joint position targets, (N, 2, J) each.
-        """
+        """Seconds of the engine alone after a reset, under targets (N, 2, J) each."""
         self.env.reset()
         start = timer()
         for target in told:
@@ -158,11 +154,7 @@ class BareTurns(Turns):
 
 
 def measure(turns: Turns, *, seconds: float) -> dict[str, Any]:
-    """Let both take turns for some seconds.
-
-    Args:
-        turns: of an environment.
-        seconds: how long to measure, burn-in excluded.
+    """Let both take turns for some seconds, burn-in excluded.
 
     Returns:
         ``env_steps_per_s``, ``physics_env_steps_per_s``, ``ratio`` (medians over
@@ -188,13 +180,7 @@ def measure(turns: Turns, *, seconds: float) -> dict[str, Any]:
 
 
 def physics_rate(env: TrackingEnv, *, seconds: float, steps: int = 32) -> float:
-    """Env steps a second of the engine alone, under targets of random actions.
-
-    Args:
-        env: environment on any engine; its worlds are reset.
-        seconds: how long to measure.
-        steps: control steps of a turn.
-    """
+    """Env steps a second of the engine alone, under targets of random actions."""
     turns = Turns(env, steps=steps)
     targets, _ = turns.loop()
     turns.replay(targets[:2])  # records what the engine records on the first call
@@ -207,9 +193,6 @@ def physics_rate(env: TrackingEnv, *, seconds: float, steps: int = 32) -> float:
 
 def room_used(env: TrackingEnv) -> dict[str, int]:
     """Contacts and constraint rows of the last substep, where the engine keeps them.
-
-    Args:
-        env: environment on any engine.
 
     Returns:
         ``nacon`` of all worlds and ``naconmax``, ``nefc`` of the fullest world and

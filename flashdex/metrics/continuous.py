@@ -17,15 +17,9 @@ MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
 
 
 def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Tensor:
-    """Draw stored mesh vertices uniformly, with replacement only if there are too few.
+    """Draw stored vertices (V, 3) uniformly, with replacement if there are too few.
 
-    Args:
-        vertices: object frame, m, (V, 3).
-        count: how many; DexMachina 500.
-        seed: DexMachina 42, FlashCHORD 0.
-
-    Returns:
-        (count, 3).
+    DexMachina draws 500 with seed 42, FlashCHORD uses seed 0.
     """
     rng = np.random.default_rng(seed)
     rows = rng.choice(len(vertices), size=count, replace=len(vertices) < count)
@@ -86,10 +80,5 @@ def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
 
 
 def smoothness(qvel: Tensor, *, fps: float) -> float:
-    """Mean squared joint acceleration, from differences of stored velocities.
-
-    Args:
-        qvel: joint velocities, rad/s or m/s, (T, n).
-        fps: control rate, Hz.
-    """
+    """Mean squared joint acceleration, from differences of stored velocities (T, n)."""
     return float(((qvel[1:] - qvel[:-1]) * fps).square().mean())

@@ -58,13 +58,9 @@ class NoiseRepetition(nn.Module):
 
     @torch.no_grad()
     def forward(self, shape: tuple[int, int, int]) -> Tensor:
-        """Noise of the next step.
+        """Standard normal noise of the next step.
 
-        Args:
-            shape: groups, environments, actions (G, N, A). A change redraws everything.
-
-        Returns:
-            (G, N, A), standard normal.
+        The shape is groups, environments, actions (G, N, A); a change redraws all.
         """
         fits = tuple(self.noise.shape) == tuple(shape)
         # a loaded state may come from the other clock

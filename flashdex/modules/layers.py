@@ -31,13 +31,7 @@ def held(parameter: Tensor, mode: Mode) -> Tensor:
 
 
 class PlainLinear(nn.Module):
-    """``y = x W^T`` of E members, without projection; weights start at zero.
-
-    Args:
-        in_features: size of the input.
-        out_features: size of the output.
-        ensemble: number of members E.
-    """
+    """``y = x W^T`` of E members, without projection; weights start at zero."""
 
     def __init__(
         self, in_features: int, out_features: int, *, ensemble: int = 1

@@ -37,14 +37,7 @@ class FlashBlock(nn.Module):
 
 
 class FlashTrunk(nn.Module):
-    """Embed, N residual blocks and one RMSNorm, for E members at once.
-
-    Args:
-        in_features: total width of the input parts.
-        width: size d of the residual stream.
-        num_blocks: number N of residual blocks, at least one.
-        ensemble: number of members E.
-        column_mask: see `InputEmbed`.
+    """Embed, N residual blocks of width d and one RMSNorm, for E members at once.
 
     Example:
         >>> trunk = FlashTrunk(5, 8, ensemble=2)

@@ -119,9 +119,8 @@ class FlashSACLoss(LossModule):
         self.reward_normalizer = reward_normalizer
         self.gamma, self.n_steps, self.exact_discount = gamma, n_steps, exact_discount
         self.own_action_gate = own_action_gate
-        self.log_alpha = nn.Parameter(
-            torch.full((len(self.groups),), float(alpha_init)).log()
-        )
+        alpha = torch.full((len(self.groups),), float(alpha_init))
+        self.log_alpha = nn.Parameter(alpha.log())
         encoders = (actor_network.future_encoder, qvalue_network.future_encoder)
         self._reads_future = any(encoder is not None for encoder in encoders)
         self.target_entropy = target_entropy(actor_network.action_dim, target_sigma)
@@ -138,9 +137,8 @@ class FlashSACLoss(LossModule):
         self, prefix: str = "", recurse: bool = True, remove_duplicate: bool = True
     ) -> Iterator[tuple[str, nn.Parameter]]:
         """Trained parameters; those of the target are left out."""
-        for name, parameter in nn.Module.named_parameters(
-            self, prefix, recurse, remove_duplicate
-        ):
+        options = (prefix, recurse, remove_duplicate)
+        for name, parameter in nn.Module.named_parameters(self, *options):
             if "target_qvalue_network" not in name:
                 yield name, parameter
 

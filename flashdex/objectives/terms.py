@@ -22,10 +22,10 @@ def categorical_projection(
 
     Args:
         prob: distribution of the next state-action pair, (..., Z).
-        reward: scaled reward (n-step sum), (...).
-        discount: gamma^k of the true window, (...).
-        terminated: 1 where the window ends in a true termination, (...).
-        entropy_cost: ``alpha log pi(a' | s')``, (...).
+        reward: scaled reward (n-step sum), (...), as all that follow.
+        discount: gamma^k of the true window.
+        terminated: 1 where the window ends in a true termination.
+        entropy_cost: ``alpha log pi(a' | s')``.
         v_max: end of the support.
 
     Returns:
@@ -33,9 +33,8 @@ def categorical_projection(
     """
     last = prob.shape[-1] - 1
     spacing = 2.0 * v_max / last
-    atoms = torch.linspace(
-        -v_max, v_max, last + 1, dtype=prob.dtype, device=prob.device
-    )
+    like = {"dtype": prob.dtype, "device": prob.device}
+    atoms = torch.linspace(-v_max, v_max, last + 1, **like)
     carry = (discount * (1.0 - terminated)).unsqueeze(-1)
     moved = reward.unsqueeze(-1) + carry * (atoms - entropy_cost.unsqueeze(-1))
     position = (moved.clamp(-v_max, v_max) + v_max) / spacing
@@ -54,11 +53,7 @@ def categorical_projection(
 def own_action_views(action: Tensor) -> Tensor:
     """Joint action once per group; only the group's own part carries gradient.
 
-    Args:
-        action: fresh samples, (G, B, A).
-
-    Returns:
-        (B, A) for one group, else (G, B, G A).
+    From fresh samples (G, B, A) to (B, A) for one group, else (G, B, G A).
     """
     joint = side_by_side(action)
     groups, _, width = action.shape

@@ -31,17 +31,10 @@ from flashdex.training.checkpoint import has_checkpoint, load_checkpoint
 from tests.synthetic import write_library
 
 KINDS = ("storing", "training", "saving", "startup")
-TINY = [
-    "env.num_envs=16",
-    "algo.batch_size=32",
-    "algo.min_buffer=500",
-    "algo.updates_per_step=0.25",
-    "train.log_every_s=1",
-    "train.stop_when_all_converted=false",
-    "train.checkpoint_replay=true",
-    "train.keep_checkpoints=2",
-    "train.render_conversions=false",
-]
+TINY = ["env.num_envs=16", "algo.batch_size=32", "algo.min_buffer=500"]
+TINY += ["algo.updates_per_step=0.25", "train.log_every_s=1"]
+TINY += ["train.stop_when_all_converted=false", "train.checkpoint_replay=true"]
+TINY += ["train.keep_checkpoints=2", "train.render_conversions=false"]
 
 
 class Victim:
@@ -72,7 +65,7 @@ class Victim:
             words = ["--resume", str(self.run_dir), *overrides]
         with (self.folder / "output.txt").open("ab") as output:
             return subprocess.Popen(
-                [sys.executable, "-m", "flashdex.cli.main", "train", *words],
+                [sys.executable, "-m", "flashdex.cli", "train", *words],
                 cwd=self.folder,
                 stdout=output,
                 stderr=output,
@@ -134,23 +127,16 @@ class Victim:
         """Work of this session after its newest checkpoint, s and env steps."""
         records = read_lines(self.run_dir / "metrics.jsonl")
         starts = read_lines(self.run_dir / "sessions.jsonl")
-        lost = {"lost_s": 0.0, "env_steps": 0, "lost_env_steps": 0}
-        since = starts[-1]["wall_s"] if starts else 0.0
+        since, env_steps = starts[-1]["wall_s"] if starts else 0.0, 0
         if has_checkpoint(self.run_dir):
             state = load_checkpoint(self.run_dir)
-            lost["env_steps"] = state["env_steps"]
-            since = max(since, state["wall_s"])
+            env_steps, since = state["env_steps"], max(since, state["wall_s"])
+        lost = {"lost_s": 0.0, "env_steps": env_steps, "lost_env_steps": 0}
         if records:
-            reached = records[-1]["env_steps"] - lost["env_steps"]
-            lost["lost_env_steps"] = max(0, int(reached))
+            lost["lost_env_steps"] = max(0, int(records[-1]["env_steps"] - env_steps))
             seconds = 3600 * records[-1]["hours"] - since
             lost["lost_s"] = round(max(0.0, seconds), 2)
         return lost
-
-    def num_adopted(self) -> int:
-        """Rollouts that were stored before a kill and got their line after it."""
-        text = (self.folder / "output.txt").read_text(encoding="utf-8")
-        return text.count("its stored rollout had no line yet")
 
     def check_ledger(self) -> None:
         """Every line that was ever whole is still there, in its place."""
@@ -181,12 +167,11 @@ def check_conversions(run_dir: Path) -> dict[str, Any]:
     assert converted == set(found), (converted, set(found))
     disagree = [name for name, one in found.items() if not one.agrees]
     assert not disagree, disagree
-    certified = sum(one.holds for one in found.values())
     return {
         "attempts": len(lines),
         "conversions": sorted(converted),
         "rollouts_that_replay_as_stored": len(found),
-        "certified": certified,
+        "certified": sum(one.holds for one in found.values()),
     }
 
 
@@ -224,6 +209,7 @@ def run_test(
     assert process.wait() == 0, "the last session failed"
     assert read_lines(victim.run_dir / "sessions.jsonl")[-1]["why"] == "budget"
     victim.check_ledger()
+    output = (folder / "output.txt").read_text(encoding="utf-8")
     most = max(entry["lost_s"] for entry in log)
     # a checkpoint is due at the first vector step after the interval
     assert most < interval + 2.0, f"{most} s were lost"
@@ -232,7 +218,8 @@ def run_test(
         "checkpoint_every_s": interval,
         "most_lost_s": most,
         "clean_stop": "SIGTERM: exit code 0",
-        "lines_written_by_a_resume": victim.num_adopted(),
+        # rollouts that were stored before a kill and got their line after it
+        "lines_written_by_a_resume": output.count("its stored rollout had no line yet"),
         **check_curves(victim.run_dir),
         **check_conversions(victim.run_dir),
     }
@@ -241,17 +228,17 @@ def run_test(
 def main() -> None:
     """Run the test and print its summary."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--interval", type=float, default=5.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", type=Path, required=True, help="empty folder")
-    parser.add_argument("--out", type=Path, help="write the summary here, too")
+    add = parser.add_argument
+    add("--kills", type=int, default=20)
+    add("--interval", type=float, default=5.0)
+    add("--seed", type=int, default=0)
+    add("--folder", type=Path, required=True, help="empty folder")
+    add("--out", type=Path, help="write the summary here, too")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     args.folder.mkdir(parents=True, exist_ok=True)
-    summary = run_test(
-        args.folder.resolve(), kills=args.kills, interval=args.interval, seed=args.seed
-    )
+    times = {"kills": args.kills, "interval": args.interval, "seed": args.seed}
+    summary = run_test(args.folder.resolve(), **times)
     text = json.dumps(summary, indent=1)
     if args.out is not None:
         args.out.write_text(text + "\n", encoding="utf-8")

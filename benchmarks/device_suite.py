@@ -122,7 +122,7 @@ def _curve(choice: Choice) -> Iterator[Job]:
     run = choice.scratch / "curve"
     # the rest of the call is for building the scenes and the last checkpoint
     limit = max(0.5, choice.minutes - (0.2 if choice.tiny else 1.5)) * 60
-    words = ["flashdex.cli.main", "train", RECIPE, f"run_dir={run}"]
+    words = ["flashdex.cli", "train", RECIPE, f"run_dir={run}"]
     words.append(f"motions.library={choice.libraries / CURVE_LIBRARY}")
     words += [f"physics={choice.engine}", f"train.wall_limit_s={limit:g}"]
     words += ["train.render_conversions=false", "train.checkpoint_every_s=100000"]
@@ -187,31 +187,22 @@ def parse_lines(text: str) -> list[dict[str, Any]]:
     return found
 
 
-class _Curve:
-    """The records of a running job, written as they come; half a line waits."""
-
-    def __init__(self, job: Job, lines: Lines) -> None:
-        self.job, self.lines, self.read = job, lines, 0
-
-    def write_new(self) -> None:
-        path = self.job.watch
-        if path is None or not path.is_file():
-            return
-        text = path.read_bytes()
-        end = text.rfind(b"\n") + 1
-        fresh, self.read = text[self.read : end], max(self.read, end)
-        kept = ("env_steps", "hours", "updates", "perf/env_steps_per_s")
-        for record in parse_lines(fresh.decode("utf-8", errors="replace")):
-            curve = {
-                k: v for k, v in record.items() if k in kept or k.startswith("convert/")
-            }
-            self.lines.write(self.job, {"benchmark": "curve", **curve})
+def _write_new(job: Job, lines: Lines, read: int) -> int:
+    """Write what a running job has recorded since ``read`` bytes; half a line waits."""
+    if job.watch is None or not job.watch.is_file():
+        return read
+    text = job.watch.read_bytes()
+    end = max(read, text.rfind(b"\n") + 1)
+    kept = ("env_steps", "hours", "updates", "perf/env_steps_per_s")
+    for record in parse_lines(text[read:end].decode("utf-8", errors="replace")):
+        names = [k for k in record if k in kept or k.startswith("convert/")]
+        lines.write(job, {"benchmark": "curve", **{k: record[k] for k in names}})
+    return end
 
 
 def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
     """Run one job to its end or its limit, and write what it has found."""
-    begin, why = time.monotonic(), ""
-    curve = _Curve(job, lines)
+    begin, why, read = time.monotonic(), "", 0
     with (
         (scratch / "stdout").open("w+b") as stdout,
         (scratch / "stderr").open("w+b") as stderr,
@@ -222,7 +213,7 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
                 if time.monotonic() - begin > limit_s:
                     why = f"stopped after {limit_s:.0f} s"
                     break
-                curve.write_new()
+                read = _write_new(job, lines, read)
                 time.sleep(POLL_S)
         finally:
             stop(process)
@@ -230,7 +221,7 @@ def run_job(job: Job, lines: Lines, *, limit_s: float, scratch: Path) -> None:
             results = parse_lines(_text(stdout))
             for found in results:
                 lines.write(job, found, seconds=spent)
-            curve.write_new()
+            _write_new(job, lines, read)
             if process.returncode and not why:
                 why = f"exit code {process.returncode}"
             if why or (not results and job.watch is None):
@@ -293,9 +284,7 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Parse, unpack the libraries, run."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
     add("--part", choices=PARTS, required=True)
     add("--minutes", type=float, default=9.0, help="of the whole call")
@@ -313,14 +302,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _interrupted)
     with tempfile.TemporaryDirectory(prefix="flashdex-suite-") as folder:
         scratch = Path(folder)
-        choice = Choice(
-            engine=args.engine,
-            libraries=unpack(args.libraries, scratch / "libraries"),
-            tiny=args.tiny,
-            minutes=args.minutes,
-            overrides=args.overrides,
-            scratch=scratch,
-        )
+        libraries = unpack(args.libraries, scratch / "libraries")
+        rest = (args.tiny, args.minutes, args.overrides, scratch)
+        choice = Choice(args.engine, libraries, *rest)
         lines = Lines(args.out.resolve(), args.part)
         run_part(args.part, choice, lines)
         if not lines.results:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch.utils.benchmark import timer
 
 from benchmarks.common import output
@@ -153,13 +153,21 @@ def _make_block(
     """PUSH packed rows on the learner's device, and the seconds packing takes."""
     generator = torch.Generator().manual_seed(0)
     shape = (env.num_envs, 2, env.bank.num_joints)
-    found: list[TensorDict] = []
+    device, found = learner.device, []
     td = env.reset()
     for _ in range(SOURCE_STEPS):
         action = 2 * torch.rand(shape, generator=generator) - 1
         env.put_action(td, action)
         td = env.step(td)
-        row = _push(learner, td, action)
+        after = td.get("next").to(device)
+        row = learner.nstep.push(
+            td.select(*keys.STATE).to(device),
+            action.to(device),
+            torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1),
+            after.select(*keys.STATE),
+            after[keys.TERMINATED],
+            after[keys.DONE],
+        )
         if row is not None:
             found.append(row)
         td = env.restart(td["next", keys.DONE].squeeze(-1))
@@ -167,22 +175,6 @@ def _make_block(
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
     rows, codec = rows[chosen], learner.codec
     return codec.pack(rows), seconds_each(lambda: codec.pack(rows), seconds=seconds)
-
-
-def _push(
-    learner: FlashSACLearner, td: TensorDictBase, action: torch.Tensor
-) -> TensorDict | None:
-    device = learner.device
-    after = td.get("next").to(device)
-    reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
-    return learner.nstep.push(
-        td.select(*keys.STATE).to(device),
-        action.to(device),
-        reward,
-        after.select(*keys.STATE),
-        after[keys.TERMINATED],
-        after[keys.DONE],
-    )
 
 
 def _fill(learner: FlashSACLearner, block: TensorDict, rows: int) -> dict[str, Any]:
@@ -216,16 +208,11 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     parser = output.make_parser("replay", __doc__)
     output.add_recipe_options(parser)
     parser.set_defaults(objects=2)
-    parser.add_argument(
-        "--rows", type=count_of, nargs="+", default=[100_000], help="100k, 1M ..."
-    )
-    parser.add_argument(
-        "--replay", choices=["auto", "device", "pinned", "cpu"], help="where they lie"
-    )
-    parser.add_argument(
-        "--batch", type=int, help="rows a sample; the recipe's if absent"
-    )
-    parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
+    add, places = parser.add_argument, ["auto", "device", "pinned", "cpu"]
+    add("--rows", type=count_of, nargs="+", default=[100_000], help="100k, 1M ...")
+    add("--replay", choices=places, help="where they lie")
+    add("--batch", type=int, help="rows a sample; the recipe's if absent")
+    add("--seconds", type=float, default=2.0, help="for each figure")
     return parser.parse_intermixed_args(words)
 
 

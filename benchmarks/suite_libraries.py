@@ -49,9 +49,7 @@ def pack(folder: Path, archive: Path) -> Path:
 
 def main() -> None:
     """Prepare, pack, and print one JSON line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--pack", type=Path, metavar="FILE.tar.xz")

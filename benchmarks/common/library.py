@@ -57,7 +57,6 @@ def _crossings(vertices: Vertices, height: NDArray[np.float64]) -> Vertices:
 
 
 def _corners(vertices: Vertices) -> Vertices:
-    """Vertices of the hull, each once."""
     return vertices[ConvexHull(vertices).vertices]
 
 

@@ -17,12 +17,7 @@ from flashdex.system.machine import describe_commit, describe_machine
 
 
 def make_parser(name: str, about: str | None) -> argparse.ArgumentParser:
-    """A parser with the options that every benchmark has.
-
-    Args:
-        name: module in `benchmarks`.
-        about: its docstring.
-    """
+    """A parser with the options that every benchmark has, and its docstring."""
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}",
         description=about,
@@ -37,28 +32,19 @@ def make_parser(name: str, about: str | None) -> argparse.ArgumentParser:
 
 def add_recipe_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose recipe, worlds and scene."""
-    parser.add_argument(
-        "--recipe", default="quickstart", help="name or path (%(default)s)"
-    )
-    parser.add_argument("--num-envs", type=int, help="worlds; the recipe's if absent")
-    parser.add_argument(
-        "--objects", type=int, help="made-up motions of 1 or 2 objects; --hulls too"
-    )
-    parser.add_argument(
-        "--hulls", type=int, help="convex parts of each made-up object, 1 to 16"
-    )
-    parser.add_argument(
-        "--libraries", type=Path, help="folder of the made-up libraries (the cache)"
-    )
-    parser.add_argument("overrides", nargs="*", metavar="key=value")
+    add = parser.add_argument
+    add("--recipe", default="quickstart", help="name or path (%(default)s)")
+    add("--num-envs", type=int, help="worlds; the recipe's if absent")
+    add("--objects", type=int, help="made-up motions of 1 or 2 objects; --hulls too")
+    add("--hulls", type=int, help="convex parts of each made-up object, 1 to 16")
+    add("--libraries", type=Path, help="folder of the made-up libraries (the cache)")
+    add("overrides", nargs="*", metavar="key=value")
 
 
 def compose_bench(args: argparse.Namespace, *, changes: Sequence[str] = ()) -> Recipe:
     """The recipe that the options of `add_recipe_options` ask for.
 
-    Args:
-        args: parsed options.
-        changes: overrides that stand before those of the command line.
+    The changes are overrides that stand before those of the command line.
     """
     overrides = list(changes)
     if args.num_envs is not None:
@@ -77,15 +63,7 @@ def compose_tracking(name: str, overrides: Sequence[str]) -> Recipe:
 
 
 def emit(result: dict[str, Any], *, out: Path | None = None) -> dict[str, Any]:
-    """Print a result with hardware and commit, and append it to a file.
-
-    Args:
-        result: what was measured.
-        out: file of JSON lines, or None.
-
-    Returns:
-        The printed object.
-    """
+    """Print a result with hardware and commit, append it to a file, and return it."""
     whole = {**result, "hardware": describe_machine(), "commit": describe_commit()}
     print(json.dumps(whole), flush=True)
     if out is not None:

@@ -23,6 +23,8 @@ from flashdex.modules.future import FutureEncoder
 from flashdex.modules.layers import UnitBatchNorm
 from flashdex.objectives.flashsac import FlashSACLoss
 
+Source = FlashActor | EnsembleCritic
+
 
 def batch_norm(features: int) -> nn.BatchNorm1d:
     """BatchNorm with momentum 0.01 and eps 1e-5."""
@@ -74,12 +76,7 @@ class PlainNetworks(nn.Module):
     """
 
     def __init__(
-        self,
-        source: FlashActor | EnsembleCritic,
-        members: Iterable[int],
-        *,
-        encoder: int,
-        unit_heads: bool,
+        self, source: Source, members: Iterable[int], *, encoder: int, unit_heads: bool
     ) -> None:
         super().__init__()
         self.unit_heads = unit_heads
@@ -109,7 +106,7 @@ class PlainNetworks(nn.Module):
 
 
 @torch.no_grad()
-def _copy_network(source: FlashActor | EnsembleCritic, member: int) -> nn.Sequential:
+def _copy_network(source: Source, member: int) -> nn.Sequential:
     """Both list their parameters in the order of the data."""
     trunk, head = source.trunk, source.head.weight
     outputs, width = head.shape[1:]
@@ -198,9 +195,7 @@ def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> tuple[Tensor, Ten
 class PlainLearner(nn.Module):
     """Separate networks, Python loops over groups, members and parameters.
 
-    Args:
-        loss: of joint-action twin critics, from whose present state it starts.
-        lr: learning rate, constant.
+    It starts from the present state of a loss of joint-action twin critics.
     """
 
     atoms: Tensor
@@ -222,9 +217,8 @@ class PlainLearner(nn.Module):
         self.log_alpha = nn.Parameter(loss.log_alpha.detach().clone())
         self.log_std_range = actor.log_std_range
         self.target_entropy, self.gate = loss.target_entropy, loss.own_action_gate
-        atoms = torch.linspace(
-            -critic.v_max, critic.v_max, critic.num_atoms, dtype=torch.float64
-        )
+        end, count = critic.v_max, critic.num_atoms
+        atoms = torch.linspace(-end, end, count, dtype=torch.float64)
         self.register_buffer("atoms", atoms.to(self.log_alpha))
         self.actor_adam = torch.optim.Adam(self.actors.parameters(), lr=lr)
         self.alpha_adam = torch.optim.Adam([self.log_alpha], lr=lr)

@@ -33,13 +33,9 @@ class Turn(NamedTuple):
 class Turns:
     """Any engine: all worlds are reset, then the engine repeats the same targets.
 
-    The environment's loop runs some control steps; then the engine repeats them from
-    the same draw: no observation, no judge, no reset, no wrench.
-
-    Args:
-        env: environment on any engine.
-        steps: control steps of a turn; the default is half a second of simulated time.
-        seed: of the random actions.
+    The environment's loop runs some control steps, half a second of simulated time;
+    then the engine repeats them from the same draw: no observation, no judge, no reset,
+    no wrench.
     """
 
     burn_in = 2  # turns that are not counted
@@ -63,7 +59,7 @@ class Turns:
         """
         env, told = self.env, []
         shape = (env.num_envs, 2, env.bank.num_joints)
-        td = self.begin()
+        td = self.start()
         start = timer()
         for _ in range(self.steps):
             action = torch.rand(shape, generator=self.generator, device=env.device)
@@ -74,9 +70,8 @@ class Turns:
             # as the training loop does
             nothing_ends = env.host_sees and not done.any()
             td = step_mdp(td) if nothing_ends else env.restart(done)
-        spent = timer() - start
-        self.end(td)
-        return told, spent
+        self.td = td
+        return told, timer() - start
 
     @torch.no_grad()
     def replay(self, told: list[Any]) -> float:
@@ -87,7 +82,7 @@ class Turns:
             self.env.physics.step(target)
         return timer() - start
 
-    def begin(self) -> TensorDictBase:
+    def start(self) -> TensorDictBase:
         """What the environment starts a turn from."""
         return self.env.reset()
 
@@ -95,19 +90,12 @@ class Turns:
         """What the physics was told in a step, for `replay`."""
         return after[keys.JOINT_TARGET]
 
-    def end(self, td: TensorDictBase) -> None:
-        """Keep what the next turn needs."""
-
 
 class BareTurns(Turns):
     """The cpu engine: a bare ``mujoco.batch`` follows the environment turn by turn.
 
-    Both step the very same models from the same states under the same controls.
-
-    Args:
-        env: environment on the cpu engine.
-        num_threads: threads of the bare batch; as the environment's.
-        seed: of the random actions.
+    Both step the very same models from the same states under the same controls, with
+    as many threads.
     """
 
     burn_in = 4
@@ -132,17 +120,13 @@ class BareTurns(Turns):
         controls, spent = self.loop()
         return Turn(spent, self.replay(controls))
 
-    def begin(self) -> TensorDictBase:
+    def start(self) -> TensorDictBase:
         """Where the last turn ended."""
         return self.td
 
     def told(self, after: TensorDictBase) -> Any:
         """Controls of all worlds, (N, nu)."""
         return np.array(self.physics.batch.bind("ctrl"))
-
-    def end(self, td: TensorDictBase) -> None:
-        """Go on from here."""
-        self.td = td
 
     def replay(self, told: list[Any]) -> float:
         """Seconds of the bare batch under the given controls."""

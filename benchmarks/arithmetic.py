@@ -22,13 +22,9 @@ ROW_BYTES = 990  # two XHands, two objects: `python -m benchmarks.replay`
 
 
 def flop_of(batch: int) -> float:
-    """Operations of the products of one update at the paper's widths.
-
-    Args:
-        batch: rows B.
-    """
+    """Operations of the products of one update of B rows at the paper's widths."""
     size = replace(SIZES["paper"], batch=batch)
-    stepper, td = FlashSACStepper(make_loss(size)), make_batch(size)[0]
+    stepper, td = FlashSACStepper(make_loss(size)), make_batch(size)
     stepper.update(td)  # the first one makes the optimisers' state
     stepper.update(td)
     pair = count_products(lambda: (stepper.update(td), stepper.update(td)))
@@ -36,11 +32,7 @@ def flop_of(batch: int) -> float:
 
 
 def bytes_of(batch: int) -> dict[str, float]:
-    """Bytes that an update has to move at least, by what for.
-
-    Args:
-        batch: rows B.
-    """
+    """Bytes that an update of B rows has to move at least, by what for."""
     size = SIZES["paper"]
     loss = make_loss(replace(size, batch=2))
     critic = sum(p.numel() for p in loss.qvalue_network.parameters())
@@ -74,20 +66,17 @@ def main() -> None:
     moved = bytes_of(args.batch)
     traffic = sum(v for k, v in moved.items() if k.endswith("_gb"))
     bfloat16, tf32 = args.tflops
-    print(
-        json.dumps(
-            {
-                "arithmetic": "update",
-                "batch": args.batch,
-                "gflop_counted": [round(small / 1e9, 2), round(large / 1e9, 2)],
-                "tflop_per_update": round(flop / 1e12, 3),
-                **{k: round(v, 4) for k, v in moved.items()},
-                "ms_products_bfloat16": round(flop / bfloat16 / 1e9, 2),
-                "ms_products_tf32": round(flop / tf32 / 1e9, 2),
-                "ms_traffic": round(1e3 * traffic / args.gb_per_s, 2),
-            }
-        )
-    )
+    found = {
+        "arithmetic": "update",
+        "batch": args.batch,
+        "gflop_counted": [round(small / 1e9, 2), round(large / 1e9, 2)],
+        "tflop_per_update": round(flop / 1e12, 3),
+        **{k: round(v, 4) for k, v in moved.items()},
+        "ms_products_bfloat16": round(flop / bfloat16 / 1e9, 2),
+        "ms_products_tf32": round(flop / tf32 / 1e9, 2),
+        "ms_traffic": round(1e3 * traffic / args.gb_per_s, 2),
+    }
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":

@@ -25,10 +25,7 @@ def choose(
 ) -> tuple[list[str], int]:
     """Names of the chosen motions in name order, and how many were eligible.
 
-    Args:
-        report: rows of ``report.csv``.
-        scores: baseline -> motion -> {"passed": criteria}.
-        count: how many to choose.
+    Scores lead from baseline to motion to {"passed": criteria}.
     """
     eligible = [
         row

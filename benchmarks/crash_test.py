@@ -20,6 +20,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,47 +28,33 @@ from flashdex.hands.spec import load_hand
 from flashdex.rollouts.replay import replay
 from flashdex.system.jsonl import read_lines
 from flashdex.training.checkpoint import has_checkpoint, load_checkpoint
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
-from synthetic import write_library
+from tests.synthetic import write_library
 
 KINDS = ("storing", "training", "saving", "startup")
-TINY = [
-    "env.num_envs=16",
-    "algo.batch_size=32",
-    "algo.min_buffer=500",
-    "algo.updates_per_step=0.25",
-    "train.log_every_s=1",
-    "train.stop_when_all_converted=false",
-    "train.checkpoint_replay=true",
-    "train.keep_checkpoints=2",
-    "train.render_conversions=false",
-]
+TINY = ["env.num_envs=16", "algo.batch_size=32", "algo.min_buffer=500"]
+TINY += ["algo.updates_per_step=0.25", "train.log_every_s=1"]
+TINY += ["train.stop_when_all_converted=false", "train.checkpoint_replay=true"]
+TINY += ["train.keep_checkpoints=2", "train.render_conversions=false"]
 
 
 class Victim:
     """The run that is killed, and what must not get lost of it.
 
-    Args:
-        folder: empty folder; run and motion library go there.
-        interval: seconds between checkpoints.
-        overrides: further values of the recipe.
+    Run and motion library go into an empty folder; checkpoints are ``interval`` seconds
+    apart.
     """
 
-    def __init__(self, folder: Path, *, interval: float, overrides: list[str]) -> None:
+    def __init__(
+        self, folder: Path, *, interval: float, overrides: Sequence[str]
+    ) -> None:
         self.folder, self.run_dir = folder, folder / "run"
         self.interval = interval
         library = folder / "library"
         if not library.exists():
             write_library(library, load_hand("xhand"))
-        self.first = [
-            "quickstart",
-            f"motions.library={library}",
-            f"run_dir={self.run_dir}",
-            f"train.checkpoint_every_s={interval}",
-            *TINY,
-            *overrides,
-        ]
+        self.first = ["quickstart", f"motions.library={library}"]
+        self.first.append(f"run_dir={self.run_dir}")
+        self.first += [f"train.checkpoint_every_s={interval}", *TINY, *overrides]
         self.lines: list[str] = []
         self.startup_s = 10.0
 
@@ -78,7 +65,7 @@ class Victim:
             words = ["--resume", str(self.run_dir), *overrides]
         with (self.folder / "output.txt").open("ab") as output:
             return subprocess.Popen(
-                [sys.executable, "-m", "flashdex.cli.main", "train", *words],
+                [sys.executable, "-m", "flashdex.cli", "train", *words],
                 cwd=self.folder,
                 stdout=output,
                 stderr=output,
@@ -122,11 +109,8 @@ class Victim:
         rollouts: dict[str, int],
         draw: random.Random,
     ) -> None:
-        patience = time.monotonic() + draw.uniform(0.2, 2.2) * self.interval
-        if kind == "storing":
-            patience = time.monotonic() + 8 * self.interval
-        elif kind == "saving":
-            patience = time.monotonic() + 3 * self.interval
+        patience = {"storing": 8.0, "saving": 3.0}.get(kind) or draw.uniform(0.2, 2.2)
+        patience = time.monotonic() + patience * self.interval
         while time.monotonic() < patience and process.poll() is None:
             if kind == "saving" and any((self.run_dir / "checkpoints").rglob(".*.tmp")):
                 time.sleep(draw.uniform(0.0, 0.01))
@@ -143,23 +127,16 @@ class Victim:
         """Work of this session after its newest checkpoint, s and env steps."""
         records = read_lines(self.run_dir / "metrics.jsonl")
         starts = read_lines(self.run_dir / "sessions.jsonl")
-        lost = {"lost_s": 0.0, "env_steps": 0, "lost_env_steps": 0}
-        since = starts[-1]["wall_s"] if starts else 0.0
+        since, env_steps = starts[-1]["wall_s"] if starts else 0.0, 0
         if has_checkpoint(self.run_dir):
             state = load_checkpoint(self.run_dir)
-            lost["env_steps"] = state["env_steps"]
-            since = max(since, state["wall_s"])
+            env_steps, since = state["env_steps"], max(since, state["wall_s"])
+        lost = {"lost_s": 0.0, "env_steps": env_steps, "lost_env_steps": 0}
         if records:
-            reached = records[-1]["env_steps"] - lost["env_steps"]
-            lost["lost_env_steps"] = max(0, int(reached))
+            lost["lost_env_steps"] = max(0, int(records[-1]["env_steps"] - env_steps))
             seconds = 3600 * records[-1]["hours"] - since
             lost["lost_s"] = round(max(0.0, seconds), 2)
         return lost
-
-    def num_adopted(self) -> int:
-        """Rollouts that were stored before a kill and got their line after it."""
-        text = (self.folder / "output.txt").read_text(encoding="utf-8")
-        return text.count("its stored rollout had no line yet")
 
     def check_ledger(self) -> None:
         """Every line that was ever whole is still there, in its place."""
@@ -173,19 +150,13 @@ class Victim:
 def check_curves(run_dir: Path) -> dict[str, Any]:
     """Records go forward in env steps and time; counts never go back."""
     records = read_lines(run_dir / "metrics.jsonl")
-    for key, strictly in (
-        ("env_steps", True),
-        ("hours", True),
-        ("env_steps_lost", False),
-        ("updates", False),
-        ("convert/cumulative", False),
-        ("convert/attempts", False),
-    ):
-        for a, b in itertools.pairwise(records):
-            assert b[key] > a[key] or (not strictly and b[key] == a[key]), (key, a, b)
-    last = records[-1]
     keys = ("env_steps", "env_steps_lost", "hours", "updates", "convert/cumulative")
-    return {"records": len(records), **{key: last[key] for key in keys}}
+    for a, b in itertools.pairwise(records):
+        for key in ("env_steps", "hours"):
+            assert b[key] > a[key], (key, a, b)
+        for key in (*keys, "convert/attempts"):
+            assert b[key] >= a[key], (key, a, b)
+    return {"records": len(records), **{key: records[-1][key] for key in keys}}
 
 
 def check_conversions(run_dir: Path) -> dict[str, Any]:
@@ -196,12 +167,11 @@ def check_conversions(run_dir: Path) -> dict[str, Any]:
     assert converted == set(found), (converted, set(found))
     disagree = [name for name, one in found.items() if not one.agrees]
     assert not disagree, disagree
-    certified = sum(one.holds for one in found.values())
     return {
         "attempts": len(lines),
         "conversions": sorted(converted),
         "rollouts_that_replay_as_stored": len(found),
-        "certified": certified,
+        "certified": sum(one.holds for one in found.values()),
     }
 
 
@@ -217,17 +187,11 @@ def run_test(
 ) -> dict[str, Any]:
     """Kill, resume, stop and finish a run in an empty folder; return the summary.
 
-    Args:
-        folder: where the run goes.
-        kills: how often it is killed.
-        interval: seconds between checkpoints.
-        seed: of the moments.
-        kinds: moments, taken in turn.
-        overrides: further values of the recipe.
-        last_env_steps: env steps of the session that finishes.
+    The kinds of moments are taken in turn; the session that finishes takes
+    ``last_env_steps``.
     """
     draw = random.Random(seed)
-    victim = Victim(folder, interval=interval, overrides=list(overrides))
+    victim = Victim(folder, interval=interval, overrides=overrides)
     log = []
     for number in range(kills):
         log.append(victim.kill(kinds[number % len(kinds)], draw))
@@ -245,6 +209,7 @@ def run_test(
     assert process.wait() == 0, "the last session failed"
     assert read_lines(victim.run_dir / "sessions.jsonl")[-1]["why"] == "budget"
     victim.check_ledger()
+    output = (folder / "output.txt").read_text(encoding="utf-8")
     most = max(entry["lost_s"] for entry in log)
     # a checkpoint is due at the first vector step after the interval
     assert most < interval + 2.0, f"{most} s were lost"
@@ -253,7 +218,8 @@ def run_test(
         "checkpoint_every_s": interval,
         "most_lost_s": most,
         "clean_stop": "SIGTERM: exit code 0",
-        "lines_written_by_a_resume": victim.num_adopted(),
+        # rollouts that were stored before a kill and got their line after it
+        "lines_written_by_a_resume": output.count("its stored rollout had no line yet"),
         **check_curves(victim.run_dir),
         **check_conversions(victim.run_dir),
     }
@@ -261,18 +227,18 @@ def run_test(
 
 def main() -> None:
     """Run the test and print its summary."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--interval", type=float, default=5.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--folder", type=Path, required=True, help="empty folder")
-    parser.add_argument("--out", type=Path, help="write the summary here, too")
+    parser = argparse.ArgumentParser(description=__doc__)
+    add = parser.add_argument
+    add("--kills", type=int, default=20)
+    add("--interval", type=float, default=5.0)
+    add("--seed", type=int, default=0)
+    add("--folder", type=Path, required=True, help="empty folder")
+    add("--out", type=Path, help="write the summary here, too")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     args.folder.mkdir(parents=True, exist_ok=True)
-    summary = run_test(
-        args.folder.resolve(), kills=args.kills, interval=args.interval, seed=args.seed
-    )
+    times = {"kills": args.kills, "interval": args.interval, "seed": args.seed}
+    summary = run_test(args.folder.resolve(), **times)
     text = json.dumps(summary, indent=1)
     if args.out is not None:
         args.out.write_text(text + "\n", encoding="utf-8")

@@ -10,24 +10,24 @@ hold on a busy machine, too.
 from __future__ import annotations
 
 import argparse
-import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
+from torch.utils.benchmark import timer
 
+from benchmarks.common import output
 from benchmarks.common.library import bench_library
-from benchmarks.common.output import add_output_options, emit
-from benchmarks.common.turns import TurnTaker
+from benchmarks.common.turns import Turns
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.recipe import Recipe, compose, expect_kind
 from flashdex.training.build import open_workbench
 
 STEPS = 8  # control steps of a turn
 # objects, hulls, worlds; the first one is what the others are compared with
 SIZES = [(2, 4, 128), (2, 1, 128), (2, 8, 128), (2, 16, 128), (1, 4, 128)]
 SIZES += [(1, 1, 128), (1, 16, 128), (2, 4, 64), (2, 4, 256), (2, 4, 512), (2, 4, 1024)]
+Rounds = list[list[float]]  # of each round, seconds of a world's step by size
 
 
 def make_env(
@@ -37,63 +37,59 @@ def make_env(
     library = bench_library(objects, hulls, folder=args.libraries)
     changes = [f"motions.library={library}", "motions.count=null"]
     changes += [f"env.num_envs={worlds}", "physics.num_threads=1", *args.overrides]
-    recipe = expect_kind(compose(args.recipe, changes), Recipe, where="env_growth")
+    recipe = output.compose_tracking(args.recipe, changes)
     return open_workbench(recipe).make_env()
 
 
-def measure(takers: list[TurnTaker], *, rounds: int) -> dict[str, list[list[float]]]:
+def measure(all_turns: list[Turns], *, rounds: int) -> tuple[Rounds, Rounds]:
     """Seconds of a world's step in each round: the environment's and the physics'."""
-    targets = [taker.loop()[0] for taker in takers]
-    found: dict[str, list[list[float]]] = {"env": [], "physics": []}
+    targets = [turns.loop()[0] for turns in all_turns]
+    env: Rounds = []
+    physics: Rounds = []
     for _ in range(rounds):
-        each: dict[str, list[float]] = {"env": [], "physics": []}
-        for taker, given in zip(takers, targets, strict=True):
-            worlds = taker.env.num_envs
-            each["env"].append(taker.loop()[1] / (STEPS * worlds))
-            each["physics"].append(taker.replay(given) / (STEPS * worlds))
-        for name, values in each.items():
-            found[name].append(values)
-    return found
+        env.append([])
+        physics.append([])
+        for turns, given in zip(all_turns, targets, strict=True):
+            steps = STEPS * turns.env.num_envs
+            env[-1].append(turns.loop()[1] / steps)
+            physics[-1].append(turns.replay(given) / steps)
+    return env, physics
 
 
-def relative(rounds: list[list[float]], index: int) -> float:
+def relative(rounds: Rounds, index: int) -> float:
     """Median over rounds of a size's seconds over those of the first size."""
     return round(median(values[index] / values[0] for values in rounds), 3)
 
 
-def main() -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Measure and print one JSON line a size."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = output.make_parser("env_growth", __doc__)
     parser.add_argument("--recipe", default="quickstart")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--libraries", type=Path)
-    add_output_options(parser)
     parser.add_argument("overrides", nargs="*", metavar="key=value")
-    args = parser.parse_intermixed_args()
-    begin = time.perf_counter()
-    takers = [TurnTaker(make_env(*size, args), steps=STEPS) for size in SIZES]
-    found = measure(takers, rounds=args.rounds)
-    ratios = [
-        median(p[i] / e[i] for e, p in zip(found["env"], found["physics"], strict=True))
-        for i in range(len(SIZES))
-    ]
+    args = parser.parse_intermixed_args(words)
+    begin = timer()
+    all_turns = [Turns(make_env(*size, args), steps=STEPS) for size in SIZES]
+    env, physics = measure(all_turns, rounds=args.rounds)
     for i, (objects, hulls, worlds) in enumerate(SIZES):
-        line: dict[str, Any] = {
+        ratio = median(p[i] / e[i] for e, p in zip(env, physics, strict=True))
+        line = {
             "benchmark": "growth",
             "recipe": args.recipe,
             "engine": "cpu" if not args.overrides else " ".join(args.overrides),
             "objects": objects,
             "hulls": hulls,
             "num_envs": worlds,
-            "relative_physics": relative(found["physics"], i),
-            "relative_env": relative(found["env"], i),
-            "ratio": round(ratios[i], 3),
+            "relative_physics": relative(physics, i),
+            "relative_env": relative(env, i),
+            "ratio": round(ratio, 3),
             "rounds": args.rounds,
-            "seconds": round(time.perf_counter() - begin, 1),
+            "seconds": round(timer() - begin, 1),
             "torch_threads": torch.get_num_threads(),
         }
-        emit(line, out=args.out)
+        output.emit(line, out=args.out)
 
 
 if __name__ == "__main__":
-    main()
+    output.run(main)

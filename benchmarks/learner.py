@@ -1,4 +1,4 @@
-"""``python -m benchmarks.learner``: the FlashSAC update against its plainest form.
+"""The FlashSAC update against its plainest form.
 
 Both hold the same weights and see the same batch and noise; they take turns in one
 process, so that what else runs on the machine slows both alike. An actor step comes
@@ -10,74 +10,61 @@ products would take at that rate, over what it took.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
 import torch
-from tensordict import TensorDict
-from torch import Tensor, nn
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.utils.benchmark import timer
 
+from benchmarks.common import output
 from benchmarks.common.ceilings import (
     count_products,
     float32_products,
     matmul_ceilings,
+    memory_gb,
     replay_seconds,
+    reset_peak_memory,
     total_flops,
 )
-from benchmarks.common.clock import memory_gb, now, reset_peak_memory
-from benchmarks.common.learner_recipe import measure_recipe
-from benchmarks.common.output import add_output_options, emit
-from benchmarks.common.plain_flashsac import (
-    PlainActor,
-    PlainBatch,
-    PlainCritics,
-    PlainEncoder,
-    PlainLearner,
-    PlainTrunk,
-)
+from benchmarks.common.plain_flashsac import PlainLearner, read_batch
+from flashdex import keys
+from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.future import FutureEncoder
-from flashdex.modules.trunk import FlashTrunk
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.stepper import FlashSACStepper
 from flashdex.system.allocator import keep_freed_memory
+from flashdex.training.build import open_workbench
 
 GAMMA, N_STEPS, FRAMES = 0.98, 3, 10
+BURN_IN = 2  # pairs of updates that are not counted
+ROWS_PER_BATCH = 8  # replay rows collected for the recipe's updates, in batches
+HOST = torch.device("cpu")
+Update = Callable[[], object]
 
 
 @dataclass(frozen=True)
 class LearnerSize:
-    """Shapes of one measurement.
+    """Shapes of one measurement."""
 
-    Attributes:
-        observation: width D of the observation, the window's latent excluded.
-        action: actions A of one group.
-        groups: actor-critic groups G.
-        batch: transitions B.
-        critic: width of the critics.
-        actor: width of the actors.
-        future: features C of a frame of the future window; 0 leaves the encoder out.
-        latent: output of the future encoder.
-        channels: convolutions of the future encoder.
-        threads: torch threads; None is the process's.
-        rounds: pairs of updates measured when nothing else is asked for.
-    """
-
-    observation: int
-    action: int
+    observation: int  # width D, the window's latent excluded
+    action: int  # of one group
     groups: int
     batch: int
-    critic: int
+    critic: int  # width
     actor: int
-    future: int = 0
+    future: int = 0  # features of a frame of the window; 0 leaves the encoder out
     latent: int = 128
     channels: tuple[int, int, int] = (128, 64, 32)
-    threads: int | None = None
-    rounds: int = 10
+    threads: int | None = None  # None: the process's
+    rounds: int = 10  # pairs of updates when nothing else is asked for
 
 
 SIZES = {
@@ -92,171 +79,45 @@ SIZES = {
     # the paper's recipe: minutes an update on a CPU
     "paper": LearnerSize(2308, 18, 2, 4096, 1024, 128, 78, rounds=1),
 }
+NORMAL_SIZES = ("quickstart", "b512", "b2048")
 
 
 def make_loss(size: LearnerSize) -> FlashSACLoss:
     """The library's networks and objective, fresh."""
+    window = {"num_frames": FRAMES, "latent_dim": size.latent, "widths": size.channels}
 
-    def encoder(ensemble: int) -> FutureEncoder | None:
-        if not size.future:
-            return None
-        return FutureEncoder(
-            size.future,
-            num_frames=FRAMES,
-            latent_dim=size.latent,
-            widths=size.channels,
-            ensemble=ensemble,
-        )
+    def options(width: int, ensemble: int) -> dict[str, Any]:
+        encoder = None
+        if size.future:
+            encoder = FutureEncoder(size.future, ensemble=ensemble, **window)
+        return {"num_groups": count, "width": width, "future_encoder": encoder}
 
-    count = size.groups
-    actor = FlashActor(
-        size.observation,
-        size.action,
-        num_groups=count,
-        width=size.actor,
-        future_encoder=encoder(count),
-    )
-    critic = EnsembleCritic(
-        size.observation,
-        size.action,
-        num_groups=count,
-        width=size.critic,
-        future_encoder=encoder(1),
-    )
-    return FlashSACLoss(
-        actor,
-        critic,
-        groups=[f"group{g}" for g in range(count)],
-        gamma=GAMMA,
-        n_steps=N_STEPS,
-    )
+    count, shape = size.groups, (size.observation, size.action)
+    actor = FlashActor(*shape, **options(size.actor, count))
+    critic = EnsembleCritic(*shape, **options(size.critic, 1))
+    groups = [f"group{g}" for g in range(count)]
+    return FlashSACLoss(actor, critic, groups=groups, gamma=GAMMA, n_steps=N_STEPS)
 
 
-def make_plain(
-    size: LearnerSize, loss: FlashSACLoss, *, device: torch.device | str = "cpu"
-) -> PlainLearner:
-    """The plain learner with the weights of ``loss``.
-
-    Args:
-        size: shapes.
-        loss: the library's learner.
-        device: where its tensors are made.
-    """
-    with torch.device(device):
-        return _make_plain(size, loss)
-
-
-def _make_plain(size: LearnerSize, loss: FlashSACLoss) -> PlainLearner:
-    latent = size.latent if size.future else 0
-    inputs = size.observation + latent
-
-    def encoder() -> PlainEncoder | None:
-        if not size.future:
-            return None
-        return PlainEncoder(size.future, FRAMES, size.latent, size.channels)
-
-    actors = [
-        PlainActor(inputs, size.action, size.actor, encoder())
-        for _ in range(size.groups)
-    ]
-    joint = inputs + size.groups * size.action
-    critics = PlainCritics(joint, size.critic, size.groups, encoder())
-    for member, actor in enumerate(actors):
-        _copy_actor(loss.actor_network, member, actor, size.action)
-    _copy_critics(loss.qvalue_network, critics)
-    return PlainLearner(actors, critics, action_dim=size.action)
-
-
-@torch.no_grad()
-def _copy_actor(
-    source: FlashActor, member: int, actor: PlainActor, action: int
-) -> None:
-    _copy_trunk(source.trunk, member, actor.trunk)
-    weight, bias = source.head.weight[member], source.head_bias[member]
-    for head, rows in ((actor.mean_head, slice(action)), (actor.std_head, action)):
-        part = rows if isinstance(rows, slice) else slice(rows, None)
-        head.weight.copy_(weight[part])
-        head.bias.copy_(bias[part])
-    if actor.encoder is not None and source.future_encoder is not None:
-        _copy_encoder(source.future_encoder, member, actor.encoder)
-
-
-@torch.no_grad()
-def _copy_critics(source: EnsembleCritic, critics: PlainCritics) -> None:
-    for member, trunk in enumerate(critics.trunks):
-        assert isinstance(trunk, PlainTrunk)
-        _copy_trunk(source.trunk, member, trunk)
-    for member, head in enumerate(critics.heads):
-        assert isinstance(head, nn.Linear)
-        head.weight.copy_(source.head.weight[member])
-        head.bias.copy_(source.head_bias[member])
-    if critics.encoder is not None and source.future_encoder is not None:
-        _copy_encoder(source.future_encoder, 0, critics.encoder)
-
-
-def _copy_trunk(source: FlashTrunk, member: int, trunk: PlainTrunk) -> None:
-    """Both list their parameters in data-flow order, gamma and beta before a map."""
-    for mine, other in zip(trunk.parameters(), source.parameters(), strict=True):
-        mine.copy_(other[member])
-
-
-def _copy_encoder(source: FutureEncoder, member: int, encoder: PlainEncoder) -> None:
-    layers = (encoder.conv1, encoder.conv2, encoder.conv3, encoder.read_out)
-    for layer, weight, bias in zip(layers, source.weights, source.biases, strict=True):
-        layer.weight.copy_(weight[member].view_as(layer.weight))
-        assert layer.bias is not None
-        layer.bias.copy_(bias[member])
-
-
-def make_batch(size: LearnerSize, *, seed: int = 0) -> tuple[TensorDict, PlainBatch]:
-    """The same random transitions in the layouts of both learners."""
+def make_batch(size: LearnerSize, *, seed: int = 0) -> TensorDict:
+    """Random transitions."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
-        return torch.randn(shape, generator=generator)
+        return torch.randn(size.batch, *shape, generator=generator)
 
-    rows = size.batch
-    now, after = normal(rows, size.observation), normal(rows, size.observation)
-    terminated = normal(rows, 1) > 2
-    actions = [normal(rows, size.action).tanh() for _ in range(size.groups)]
-    rewards = [0.3 * normal(rows, 1) for _ in range(size.groups)]
-    td = TensorDict({"observation": now}, [rows])
-    td.set("next", TensorDict({"observation": after, "terminated": terminated}, [rows]))
-    futures: list[Tensor | None] = [None, None]
+    now, after = normal(size.observation), normal(size.observation)
+    td = TensorDict({"observation": now}, [size.batch])
+    ended = normal(1) > 2
+    td.set("next", TensorDict({"observation": after, "terminated": ended}, [len(td)]))
+    for g in range(size.groups):
+        td.set((f"group{g}", "action"), normal(size.action).tanh())
+    for g in range(size.groups):
+        td.set(("next", f"group{g}", "reward"), 0.3 * normal(1))
     if size.future:
-        futures = [normal(rows, size.future, FRAMES) for _ in range(2)]
-        td.set("future", futures[0]).set(("next", "future"), futures[1])
-    for g, (action, reward) in enumerate(zip(actions, rewards, strict=True)):
-        td.set((f"group{g}", "action"), action)
-        td.set(("next", f"group{g}", "reward"), reward)
-    plain = PlainBatch(
-        observation=now,
-        next_observation=after,
-        future=futures[0],
-        next_future=futures[1],
-        action=torch.cat(actions, -1),
-        reward=[reward.squeeze(-1) for reward in rewards],
-        discount=torch.full((rows,), GAMMA**N_STEPS),
-        terminated=terminated.squeeze(-1).to(now.dtype),
-    )
-    return td, plain
-
-
-def move_batch(batch: PlainBatch, device: torch.device) -> PlainBatch:
-    """The batch on another device."""
-
-    def move(value: Tensor | list[Tensor] | None) -> Tensor | list[Tensor] | None:
-        if isinstance(value, list):
-            return [v.to(device) for v in value]
-        return None if value is None else value.to(device)
-
-    values = {f.name: move(getattr(batch, f.name)) for f in fields(batch)}
-    return PlainBatch(**values)  # pyright: ignore[reportArgumentType]
-
-
-BURN_IN = 2  # pairs of updates that are not counted
-HOST = torch.device("cpu")
-Update = Callable[[], object]
+        td.set("future", normal(size.future, FRAMES))
+        td.set(("next", "future"), normal(size.future, FRAMES))
+    return td
 
 
 def measure(
@@ -267,85 +128,80 @@ def measure(
     autocast: bool = False,
     device: torch.device = HOST,
 ) -> dict[str, Any]:
-    """Let the learners take turns.
-
-    Args:
-        size: shapes.
-        rounds: pairs of updates of each.
-        compile: also measure both learners compiled.
-        autocast: also measure the library's with products in bfloat16.
-        device: where everything lives.
+    """Let the learners take turns, some rounds of pairs of updates.
 
     Returns:
         Milliseconds per update, their ratios to the plain learner (medians over
         rounds), split, share of the products, GFLOP/s and their ceilings.
     """
     torch.manual_seed(0)
-    arms, stepper = _make_arms(size, compile=compile, autocast=autocast, device=device)
-    for update in arms.values():
-        _seconds_of_pair(update, device, BURN_IN)
-    times: dict[str, list[float]] = {name: [] for name in arms}
-    for _ in range(rounds):
-        for name, update in arms.items():
-            times[name].append(_seconds_of_pair(update, device))
-    out: dict[str, Any] = {
-        "rounds": rounds,
-        "baseline_ms_per_update": _ms(times["baseline"]),
-    }
+    stepper, td = FlashSACStepper(make_loss(size).to(device)), make_batch(size)
+    td = td.to(device)
+    arms = _make_arms(stepper, td, size, compile=compile, autocast=autocast)
+    # on a GPU enough updates that the end of each turn is not waited for
+    turn = 2 if device.type == "cpu" else 8
+    _seconds(arms, rounds=1, repeat=BURN_IN * turn)
+    times = _seconds(arms, rounds=rounds, repeat=turn)
+    plain = times["baseline"]
+    out: dict[str, Any] = {"rounds": rounds, "baseline_ms_per_update": _ms(plain)}
     if compile:
-        plain = times.pop("baseline_compiled")
-        out["baseline_ms_per_update_compiled"] = _ms(plain)
-        out["ratio_of_compiled"] = _ratio(times["compiled"], plain)
+        fast = times.pop("baseline_compiled")
+        out["baseline_ms_per_update_compiled"] = _ms(fast)
+        out["ratio_of_compiled"] = _ratio(times["compiled"], fast)
     for name in times.keys() - {"baseline"}:
         out[f"ms_per_update_{name}"] = _ms(times[name])
-        out[f"ratio_to_baseline_{name}"] = _ratio(times[name], times["baseline"])
+        out[f"ratio_to_baseline_{name}"] = _ratio(times[name], plain)
     out["ratio_to_baseline"] = out["ratio_to_baseline_eager"]
     whole = median(times["eager"])
-    out["split"] = _split(stepper, size, whole=whole, rounds=rounds, device=device)
+    out["split"] = _split(stepper, td, whole=whole, rounds=rounds)
     out |= _products(arms["eager"], whole, repeat=rounds, device=device)
     return out | _shares(times, out["gflop_per_update"], device)
 
 
 def _make_arms(
-    size: LearnerSize, *, compile: bool, autocast: bool, device: torch.device
-) -> tuple[dict[str, Update], FlashSACStepper]:
-    loss = make_loss(size).to(device)
-    td, plain_batch = make_batch(size)
-    td, plain_batch = td.to(device), move_batch(plain_batch, device)
+    stepper: FlashSACStepper, td: TensorDict, size: LearnerSize, **options: bool
+) -> dict[str, Update]:
+    """The updates that take turns, all on the same batch and noise."""
+    device, batch = td["observation"].device, read_batch(td, stepper.loss)
     shape = (size.groups, size.batch, size.action)
-    noise = {
+    noise: dict[str, Tensor] = {
         name: torch.randn(shape, device=device)
         for name in ("actor_noise", "target_noise")
     }
-    plain = make_plain(size, loss, device=device)
-    stepper = FlashSACStepper(loss)
+
+    def ours(**chosen: bool) -> Update:
+        other = FlashSACStepper(make_loss(size).to(device), **chosen)
+        return lambda: other.update(td, **noise)
+
+    plain = PlainLearner(stepper.loss)
     arms: dict[str, Update] = {
-        "baseline": lambda: plain.update(plain_batch, **noise),
+        "baseline": lambda: plain.update(batch, **noise),
         "eager": lambda: stepper.update(td, **noise),
     }
-    if autocast:
-        rounded = FlashSACStepper(make_loss(size).to(device), autocast=True)
-        arms["autocast"] = lambda: rounded.update(td, **noise)
-    if compile:
-        fast = FlashSACStepper(make_loss(size).to(device), compile=True)
-        arms["compiled"] = lambda: fast.update(td, **noise)
-        plain_fast = make_plain(size, loss, device=device)
-        plain_fast.compile()
-        arms["baseline_compiled"] = lambda: plain_fast.update(plain_batch, **noise)
-    if compile and autocast:
-        both = FlashSACStepper(make_loss(size).to(device), compile=True, autocast=True)
-        arms["compiled_autocast"] = lambda: both.update(td, **noise)
-    return arms, stepper
+    if options["autocast"]:
+        arms["autocast"] = ours(autocast=True)
+    if options["compile"]:
+        arms["compiled"] = ours(compile=True)
+        fast = PlainLearner(stepper.loss)
+        fast.compile_networks()
+        arms["baseline_compiled"] = lambda: fast.update(batch, **noise)
+    if all(options.values()):
+        arms["compiled_autocast"] = ours(compile=True, autocast=True)
+    return arms
 
 
-def _seconds_of_pair(update: Update, device: torch.device, pairs: int = 1) -> float:
-    """Seconds per update over pairs of updates, each with one actor step."""
-    # on a GPU enough of them that the end of each pair is not waited for
-    pairs = pairs if device.type == "cpu" else 4 * pairs
-    start = now(device)
-    for _ in range(2 * pairs):
-        update()
-    return (now(device) - start) / (2 * pairs)
+def _seconds(
+    calls: Mapping[str, Update], *, rounds: int, repeat: int = 1
+) -> dict[str, list[float]]:
+    """Seconds of each call in every round, in which they take turns."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            start = timer()
+            for _ in range(repeat):
+                call()
+            times[name].append((timer() - start) / repeat)
+    return times
 
 
 def _ratio(ours: list[float], theirs: list[float]) -> float:
@@ -358,34 +214,24 @@ def _ms(seconds: list[float]) -> float:
 
 
 def _split(
-    stepper: FlashSACStepper,
-    size: LearnerSize,
-    *,
-    whole: float,
-    rounds: int,
-    device: torch.device,
+    stepper: FlashSACStepper, td: TensorDict, *, whole: float, rounds: int
 ) -> dict[str, float]:
     """Milliseconds of one update: reading, actor, critic, and what steps weights."""
-    loss, td = stepper.loss, make_batch(size)[0].to(device)
-    noise = torch.randn(size.groups, size.batch, size.action, device=device)
+    loss = stepper.loss
     batch = loss.read(td)
+    shape = (len(loss.groups), batch.size, loss.actor_network.action_dim)
+    noise = torch.randn(shape, device=batch.action.device)
 
     def differentiate(value: Tensor) -> None:
         value.backward()
-        for parameter in loss.parameters():
-            parameter.grad = None
+        loss.zero_grad()
 
     calls: dict[str, Update] = {
         "read": lambda: loss.read(td),
         "actor": lambda: differentiate(loss.actor_objective(batch, noise)[0]),
         "critic": lambda: differentiate(loss.qvalue_objective(batch, noise)[0]),
     }
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            start = now(device)
-            call()
-            times[name].append(now(device) - start)
+    times = _seconds(calls, rounds=rounds)
     split = {name: _ms(values) for name, values in times.items()}
     split["actor"] = round(split["actor"] / stepper.actor_period, 3)
     # what is left: optimisers, projections, target average, report
@@ -425,41 +271,79 @@ def _shares(
     return out
 
 
-NORMAL_SIZES = ("quickstart", "b512", "b2048")
-
-
-def main(words: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure, and print one JSON object a size, one a line.
-
-    Args:
-        words: ``--sizes NAME ...``, ``--rounds N``, ``--threads N``, ``--compile``,
-            ``--autocast``, ``--device D``, ``--precision P``, ``--out FILE``.
+def measure_recipe(
+    name: str, overrides: Sequence[str], *, updates: int
+) -> dict[str, float | int]:
+    """Build a recipe, collect rows by random actions and measure its updates.
 
     Returns:
-        The printed objects.
+        Milliseconds per update (medians): ``sample`` draws and unpacks replay rows,
+        ``assemble`` makes the observations of both window ends, ``learn`` is the update
+        itself, ``whole`` everything; and the width it was measured at.
     """
-    args = _parse(words or [])
+    recipe = output.compose_tracking(name, ["algo.actor_delay=0", *overrides])
+    bench = open_workbench(recipe)
+    env = bench.make_env()
+    learner = bench.make_learner(env)
+    assert isinstance(learner, FlashSACLearner)
+    _collect(env, learner, rows=ROWS_PER_BATCH * recipe.algo.batch_size)
+    codec, buffer = learner.codec, learner.buffer
+    state, _ = codec.unpack(buffer.draw())
+    calls: dict[str, Update] = {
+        "sample": lambda: codec.unpack(buffer.draw()),
+        "assemble": lambda: learner.show_rows(state),
+        "whole": learner.update,
+    }
+    _seconds(calls, rounds=2 * BURN_IN)
+    times = _seconds(calls, rounds=updates)
+    parts = zip(times["whole"], times["sample"], times["assemble"], strict=True)
+    times["learn"] = [whole - sample - shown for whole, sample, shown in parts]
+    # even and odd updates differ by the actor step
+    split = {
+        phase: round(500 * (median(values[::2]) + median(values[1::2])), 3)
+        for phase, values in times.items()
+    }
+    with torch.no_grad():
+        width = learner.sample()[0][keys.OBSERVATION].shape[-1]
+    return {**split, "observation": width}
+
+
+@torch.no_grad()
+def _collect(env: TrackingEnv, learner: FlashSACLearner, *, rows: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    shape = (env.num_envs, 2, env.bank.num_joints)
+    td: TensorDictBase = env.reset()
+    while learner.num_rows < rows:
+        action = 2 * torch.rand(shape, generator=generator) - 1
+        env.put_action(td, action)
+        td, following = env.step_and_maybe_reset(td)
+        after = td.get("next")
+        reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
+        ended = after[keys.TERMINATED], after[keys.DONE]
+        learner.remember(td, action, reward, after, *ended)
+        td = following
+
+
+def main(words: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Measure, and print one JSON object a size, one a line; they are returned."""
+    args = _parse(words)
     keep_freed_memory()  # as training does; both learners gain
-    device = _device(args.device)
+    is_there = torch.cuda.is_available()
+    if args.device == "cuda" and not is_there:
+        raise FlashdexError(
+            "--device cuda, but torch sees no GPU ('flashdex doctor' "
+            "says why). Use --device cpu or auto."
+        )
+    device = torch.device("cuda" if is_there and args.device != "cpu" else "cpu")
     sizes = args.sizes or (["paper"] if device.type == "cuda" else NORMAL_SIZES)
     before = torch.get_num_threads()
     results = []
     for name in sizes:
         torch.set_num_threads(args.threads or SIZES[name].threads or before)
         with float32_products(args.precision):
-            results.append(emit(_one_size(name, args, device), out=args.out))
+            results.append(output.emit(_one_size(name, args, device), out=args.out))
     torch.set_num_threads(before)
     return results
-
-
-def _device(name: str) -> torch.device:
-    is_there = torch.cuda.is_available()
-    if name == "cuda" and not is_there:
-        raise FlashdexError(
-            "--device cuda, but torch sees no GPU ('flashdex doctor' "
-            "says why). Use --device cpu or auto."
-        )
-    return torch.device("cuda" if is_there and name != "cpu" else "cpu")
 
 
 def _one_size(
@@ -468,24 +352,15 @@ def _one_size(
     size = SIZES[name]
     rounds = args.rounds or size.rounds
     reset_peak_memory(device)
+    options = {"compile": args.compile, "autocast": args.autocast}
+    names = ("observation", "action", "groups", "batch", "critic", "actor")
     result = {
         "benchmark": "learner",
         "size": name,
         "device": str(device),
         "precision": args.precision,
-        "observation": size.observation,
-        "action": size.action,
-        "groups": size.groups,
-        "batch": size.batch,
-        "critic": size.critic,
-        "actor": size.actor,
-        **measure(
-            size,
-            rounds=rounds,
-            compile=args.compile,
-            autocast=args.autocast,
-            device=device,
-        ),
+        **{field: getattr(size, field) for field in names},
+        **measure(size, rounds=rounds, device=device, **options),
         "memory_gb": memory_gb(device),
         "torch_threads": torch.get_num_threads(),
         "torch": torch.__version__,
@@ -496,38 +371,21 @@ def _one_size(
     return result
 
 
-def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.learner")
-    parser.add_argument(
-        "--sizes",
-        nargs="+",
-        choices=SIZES,
-        help=f"what to measure ({', '.join(NORMAL_SIZES)}; paper on a GPU)",
-    )
-    parser.add_argument("--rounds", type=int, help="pairs of updates")
-    parser.add_argument("--threads", type=int, help="torch threads")
-    parser.add_argument(
-        "--compile", action="store_true", help="also both compiled; minutes a size"
-    )
-    parser.add_argument(
-        "--autocast", action="store_true", help="also with products in bfloat16"
-    )
-    parser.add_argument(
-        "--device", choices=["auto", "cpu", "cuda"], default="auto", help="where"
-    )
-    parser.add_argument(
-        "--precision",
-        choices=["highest", "high"],
-        default="highest",
-        help="of float32 products; high is TF32 on a GPU",
-    )
-    add_output_options(parser)
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        nargs="*",
-        default=[],
-        metavar="key=value",
-        help="changes of the quickstart recipe",
-    )
+def _parse(words: Sequence[str]) -> argparse.Namespace:
+    parser = output.make_parser("learner", __doc__)
+    add = parser.add_argument
+    normal = ", ".join(NORMAL_SIZES)
+    add("--sizes", nargs="+", choices=SIZES, help=f"({normal}; paper on a GPU)")
+    add("--rounds", type=int, help="pairs of updates")
+    add("--threads", type=int, help="torch threads")
+    add("--compile", action="store_true", help="also both compiled; minutes a size")
+    add("--autocast", action="store_true", help="also with products in bfloat16")
+    add("--device", choices=["auto", "cpu", "cuda"], default="auto", help="where")
+    about = "of float32 products; high is TF32 on a GPU"
+    add("--precision", choices=["highest", "high"], default="highest", help=about)
+    add("--set", dest="overrides", nargs="*", default=[], metavar="key=value")
     return parser.parse_args(words)
+
+
+if __name__ == "__main__":
+    output.run(main)

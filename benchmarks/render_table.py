@@ -17,69 +17,55 @@ from pathlib import Path
 from typing import Any
 
 Line = dict[str, Any]
-# heading and key of each column; a key may lead into a mapping with dots
-COLUMNS: dict[str, list[tuple[str, str]]] = {
-    "env": [
-        ("engine", "engine"),
-        ("worlds", "num_envs"),
-        ("objects", "objects"),
-        ("hulls", "hulls"),
-        ("env steps/s", "env_steps_per_s"),
-        ("physics alone", "physics_env_steps_per_s"),
-        ("ratio", "ratio"),
-        ("contacts", "nacon"),
-        ("rows, fullest world", "nefc"),
-        ("overflow", "overflow"),
-        ("GB on device", "memory_gb.device_used"),
-    ],
-    "train": [
-        ("engine", "engine"),
-        ("worlds", "num_envs"),
-        ("env steps/s", "env_steps_per_s"),
-        ("updates/s", "updates_per_s"),
-        ("of physics", "share_of_physics"),
-        ("of learner", "share_of_learner"),
-        ("of both in turn", "share_of_both"),
-        ("overflow", "overflow"),
-        ("GB on device", "memory_gb.device_used"),
-    ],
-    "learner": [
-        ("size", "size"),
-        ("products", "precision"),
-        ("TFLOP an update", "gflop_per_update"),
-        ("updates/s", "updates_per_s_eager"),
-        ("share", "share_of_ceiling_eager"),
-        ("bfloat16", "updates_per_s_autocast"),
-        ("share", "share_of_ceiling_autocast"),
-        ("compiled", "updates_per_s_compiled"),
-        ("compiled bfloat16", "updates_per_s_compiled_autocast"),
-        ("share", "share_of_ceiling_compiled_autocast"),
-    ],
-    "replay": [
-        ("where", "replay"),
-        ("rows", "rows"),
-        ("bytes a row", "stored_bytes_per_row"),
-        ("written/s", "written_rows_per_s"),
-        ("sampled/s", "sampled_rows_per_s"),
-        ("assembled/s", "assembled_rows_per_s"),
-        ("of a plain gather", "share_of_gather"),
-    ],
-    "growth": [
-        ("engine", "engine"),
-        ("worlds", "num_envs"),
-        ("objects", "objects"),
-        ("hulls", "hulls"),
-        ("physics, a world's step", "relative_physics"),
-        ("environment, a world's step", "relative_env"),
-        ("ratio", "ratio"),
-    ],
-    "curve": [
-        ("hours", "hours"),
-        ("env steps", "env_steps"),
-        ("env steps/s", "perf/env_steps_per_s"),
-        ("converted", "convert/cumulative"),
-        ("certified", "convert/certified"),
-    ],
+# keys of the columns by benchmark; a key may lead into a mapping with dots
+COLUMNS = {
+    "env": "engine num_envs objects hulls env_steps_per_s physics_env_steps_per_s "
+    "ratio nacon nefc overflow memory_gb.device_used",
+    "train": "engine num_envs env_steps_per_s updates_per_s share_of_physics "
+    "share_of_learner share_of_both overflow memory_gb.device_used",
+    "learner": "size precision gflop_per_update updates_per_s_eager "
+    "share_of_ceiling_eager updates_per_s_autocast share_of_ceiling_autocast "
+    "updates_per_s_compiled updates_per_s_compiled_autocast "
+    "share_of_ceiling_compiled_autocast",
+    "replay": "replay rows stored_bytes_per_row written_rows_per_s "
+    "sampled_rows_per_s assembled_rows_per_s share_of_gather",
+    "growth": "engine num_envs objects hulls relative_physics relative_env ratio",
+    "curve": "hours env_steps perf/env_steps_per_s convert/cumulative "
+    "convert/certified",
+}
+# their headings, where they are not the key
+HEADINGS = {
+    "num_envs": "worlds",
+    "env_steps_per_s": "env steps/s",
+    "physics_env_steps_per_s": "physics alone",
+    "nacon": "contacts",
+    "nefc": "rows, fullest world",
+    "memory_gb.device_used": "GB on device",
+    "updates_per_s": "updates/s",
+    "share_of_physics": "of physics",
+    "share_of_learner": "of learner",
+    "share_of_both": "of both in turn",
+    "precision": "products",
+    "gflop_per_update": "TFLOP an update",
+    "updates_per_s_eager": "updates/s",
+    "share_of_ceiling_eager": "share",
+    "updates_per_s_autocast": "bfloat16",
+    "share_of_ceiling_autocast": "share",
+    "updates_per_s_compiled": "compiled",
+    "updates_per_s_compiled_autocast": "compiled bfloat16",
+    "share_of_ceiling_compiled_autocast": "share",
+    "replay": "where",
+    "stored_bytes_per_row": "bytes a row",
+    "written_rows_per_s": "written/s",
+    "sampled_rows_per_s": "sampled/s",
+    "assembled_rows_per_s": "assembled/s",
+    "share_of_gather": "of a plain gather",
+    "relative_physics": "physics, a world's step",
+    "relative_env": "environment, a world's step",
+    "env_steps": "env steps",
+    "perf/env_steps_per_s": "env steps/s",
+    "convert/cumulative": "converted",
+    "convert/certified": "certified",
 }
 CURVE_LINES = 12  # of a curve, evenly spread, the last one included
 
@@ -110,24 +96,21 @@ def cell(key: str, value: Any) -> str:
 
 
 def table(kind: str, lines: Sequence[Line], *, rates: bool = True) -> str:
-    """A Markdown table of the lines of one kind; empty columns are left out.
+    """A Markdown table of the lines of one kind of benchmark; a row each.
 
-    Args:
-        kind: of benchmark.
-        lines: a row each.
-        rates: False leaves out what is a number a second.
+    Empty columns are left out, without ``rates`` also what is a number a second.
     """
     if kind == "curve" and len(lines) > CURVE_LINES:
         step = (len(lines) - 1) / (CURVE_LINES - 1)
         lines = [lines[round(i * step)] for i in range(CURVE_LINES)]
-    columns = [
-        (head, key)
-        for head, key in COLUMNS[kind]
+    keys = [
+        key
+        for key in COLUMNS[kind].split()
         if any(value_of(line, key) is not None for line in lines)
         and (rates or "_per_s" not in key)
     ]
-    rows = [[head for head, _ in columns], ["---"] * len(columns)]
-    rows += [[cell(key, value_of(x, key)) for _, key in columns] for x in lines]
+    rows = [[HEADINGS.get(key, key) for key in keys], ["---"] * len(keys)]
+    rows += [[cell(key, value_of(line, key)) for key in keys] for line in lines]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
@@ -164,11 +147,7 @@ def read_lines(paths: Sequence[Path]) -> list[Line]:
 
 
 def replace_between(text: str, name: str, new: str) -> str:
-    """A page with the text between the marks of a table replaced.
-
-    Raises:
-        SystemExit: the page has no such marks.
-    """
+    """A page with the text between the marks of a table replaced."""
     begin = f"<!-- table {name} -->"
     marks = re.compile(re.escape(begin) + r".*?<!-- end -->", re.DOTALL)
     if not marks.search(text):

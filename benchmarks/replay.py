@@ -1,4 +1,4 @@
-"""``python -m benchmarks.replay``: rows written and sampled a second, and bytes a row.
+"""Rows written and sampled a second, and bytes a row.
 
 The ring is filled to the last row with rows of a real environment. The ceiling is one
 wide table of the same bytes, gathered at as many random rows.
@@ -9,89 +9,81 @@ from __future__ import annotations
 import argparse
 import gc
 import re
+import sys
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict
+from torch.utils.benchmark import timer
 
-from benchmarks.common.ceilings import copy_gb_per_s, gather_seconds
-from benchmarks.common.clock import free_memory, memory_gb, now, seconds_each
+from benchmarks.common import output
+from benchmarks.common.ceilings import (
+    copy_gb_per_s,
+    gather_seconds,
+    memory_gb,
+    seconds_each,
+)
 from benchmarks.common.library import describe_scene
-from benchmarks.common.output import emit
-from benchmarks.env import add_recipe_options, compose_bench
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
 from flashdex.replay.codec import row_bytes
+from flashdex.system.machine import free_host
 from flashdex.training.build import learner_device, open_workbench
 
 SOURCE_WORLDS = 64  # of the environment whose rows are copied into the ring
 SOURCE_STEPS = 24
 PUSH = 4096  # rows pushed at once: a vector step of so many worlds
 SPARE = 0.9  # share of the free memory that a ring may take
+HOST = torch.device("cpu")
 # networks play no part: as narrow as they can be
 SMALL = ("physics=cpu", f"env.num_envs={SOURCE_WORLDS}", "algo.actor_width=8")
-SMALL += ("algo.critic_width=8", "algo.min_buffer=1")
+SMALL += ("algo.critic_width=8", "algo.min_buffer=1", "algo.kind=flashsac")
 
 
-def main(words: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure, and print one JSON object for each number of rows.
-
-    Args:
-        words: ``--rows 1M ...``, ``--replay device|pinned|cpu``, ``--batch B``,
-            ``--seconds S``, the recipe's options and ``key=value`` overrides.
-
-    Returns:
-        The printed objects.
-    """
-    args = _parse(words or [])
+def main(words: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Measure, and print one JSON object for each number of rows; they are returned."""
+    args = _parse(words)
     results = []
     for rows in args.rows:
-        changes = [*SMALL, f"algo.buffer_size={rows}", "algo.kind=flashsac"]
+        changes = [*SMALL, f"algo.buffer_size={rows}"]
         if args.replay is not None:
             changes.append(f"algo.replay={args.replay}")
         if args.batch is not None:
             changes.append(f"algo.batch_size={args.batch}")
-        recipe = compose_bench(args, where="benchmarks.replay", changes=tuple(changes))
-        results.append(emit(measure(recipe, seconds=args.seconds), out=args.out))
+        recipe = output.compose_bench(args, changes=changes)
+        results.append(output.emit(measure(recipe, seconds=args.seconds), out=args.out))
         gc.collect()
     return results
 
 
 def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
-    """Fill the ring of a recipe and sample from it.
+    """Rows a second, bytes a row, shares of the ceilings; ``algo`` says of what.
 
-    Args:
-        recipe: physics on the cpu, small networks; ``algo`` says what is measured.
-        seconds: for each figure but the filling.
-
-    Returns:
-        Rows a second, bytes a row, shares of the ceilings.
-
-    Raises:
-        FlashdexError: the rows do not fit into memory.
+    Each figure but the filling takes some seconds.
     """
     bench = open_workbench(recipe)
     learner = bench.make_learner(env := bench.make_env())
     assert isinstance(learner, FlashSACLearner)
     device, rows = learner_device(recipe), recipe.algo.buffer_size
-    kept_on = device if recipe.algo.replay in ("auto", "device") else _HOST
+    kept_on = device if recipe.algo.replay in ("auto", "device") else HOST
     block, pack = _make_block(env, learner, seconds=seconds)
     width = row_bytes(block)
     _refuse(rows, width, kept_on)
-    filled = _fill(learner, block, rows)
-    sampled = _sample(learner, width, seconds=seconds)
+    found = _fill(learner, block, rows) | _sample(learner, width, seconds=seconds)
     del learner  # the table of the ceiling takes its place
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
-    places = {"kept_on": kept_on, "device": device}
     batch = recipe.algo.batch_size
     # threads may still hold the ring: the table takes no more than there is room for
-    table = min(rows, int(SPARE * free_memory(kept_on)) // (2 * width))
-    gather = gather_seconds(table, width, batch, seconds=seconds, **places)
+    table = min(rows, int(SPARE * _free_memory(kept_on)) // (2 * width))
+    gather = gather_seconds(
+        table, width, batch, kept_on=kept_on, device=device, seconds=seconds
+    )
     size = min(rows * width, 1 << 30)
     return {
         "benchmark": "replay",
@@ -103,11 +95,10 @@ def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
         "batch": batch,
         **describe_scene(bench.library),
         "packed_rows_per_s": round(len(block) / pack),
-        **filled,
-        **sampled,
+        **found,
         "ceiling_rows_per_s": round(batch / gather),
         "ceiling_table_rows": table,
-        "share_of_gather": round(1e3 * gather / sampled["ms_sample"], 3),
+        "share_of_gather": round(1e3 * gather / found["ms_sample"], 3),
         "copy_gb_per_s": copy_gb_per_s(kept_on, num_bytes=size, seconds=seconds),
         "torch_threads": torch.get_num_threads(),
     }
@@ -115,12 +106,11 @@ def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
 
 def _sample(learner: FlashSACLearner, width: int, *, seconds: float) -> dict[str, Any]:
     """Rows drawn a second, as they are and as what the loss reads; bytes a row."""
-    device, batch = learner.device, learner.config.batch_size
-    draw = seconds_each(lambda: learner.buffer.draw(), device, seconds=seconds)
-    whole = seconds_each(lambda: learner.sample(), device, seconds=seconds)
+    batch = learner.config.batch_size
+    draw = seconds_each(learner.buffer.draw, seconds=seconds)
+    whole = seconds_each(learner.sample, seconds=seconds)
     rows: Any = learner.buffer.storage
-    leaves = rows._storage.values()
-    kept = sum(leaf.numel() * leaf.element_size() for leaf in leaves)
+    kept = sum(leaf.numel() * leaf.element_size() for leaf in rows._storage.values())
     return {
         "bytes_per_row": width,
         "stored_bytes_per_row": round(kept / rows.max_size, 2),
@@ -130,11 +120,15 @@ def _sample(learner: FlashSACLearner, width: int, *, seconds: float) -> dict[str
         "ms_sample": round(1e3 * draw, 4),
         "ms_sample_assembled": round(1e3 * whole, 4),
         "sampled_gb_per_s": round(batch * width / draw / 1e9, 3),
-        "memory_gb": memory_gb(device),
+        "memory_gb": memory_gb(learner.device),
     }
 
 
-_HOST = torch.device("cpu")
+def _free_memory(device: torch.device) -> int:
+    """Bytes that can still be allocated; what cannot be known does not limit."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    return free_host() or sys.maxsize
 
 
 def _refuse(rows: int, width: int, kept_on: torch.device) -> None:
@@ -143,7 +137,7 @@ def _refuse(rows: int, width: int, kept_on: torch.device) -> None:
             f"--rows {rows} is less than the {PUSH} that are written at "
             "once. Ask for more."
         )
-    needed, free = rows * width, free_memory(kept_on)
+    needed, free = rows * width, _free_memory(kept_on)
     if needed > SPARE * free:
         raise FlashdexError(
             f"{rows} rows of {width} bytes are {needed / 1e9:.1f} GB, "
@@ -159,86 +153,68 @@ def _make_block(
     """PUSH packed rows on the learner's device, and the seconds packing takes."""
     generator = torch.Generator().manual_seed(0)
     shape = (env.num_envs, 2, env.bank.num_joints)
-    found: list[TensorDict] = []
+    device, found = learner.device, []
     td = env.reset()
     for _ in range(SOURCE_STEPS):
         action = 2 * torch.rand(shape, generator=generator) - 1
         env.put_action(td, action)
         td = env.step(td)
-        row = _push(learner, td, action)
+        after = td.get("next").to(device)
+        row = learner.nstep.push(
+            td.select(*keys.STATE).to(device),
+            action.to(device),
+            torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1),
+            after.select(*keys.STATE),
+            after[keys.TERMINATED],
+            after[keys.DONE],
+        )
         if row is not None:
             found.append(row)
         td = env.reset_worlds(td["next", keys.DONE].squeeze(-1))
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
-    rows = rows[chosen]
-    codec = learner.codec
-    pack = seconds_each(lambda: codec.pack(rows), learner.device, seconds=seconds)
-    return codec.pack(rows), pack
+    rows, codec = rows[chosen], learner.codec
+    return codec.pack(rows), seconds_each(lambda: codec.pack(rows), seconds=seconds)
 
 
-def _push(
-    learner: FlashSACLearner, td: TensorDict, action: torch.Tensor
-) -> TensorDict | None:
-    device = learner.device
-    after = td.get("next").to(device)
-    reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
-    return learner.nstep.push(
-        td.select(*keys.STATE).to(device),
-        action.to(device),
-        reward,
-        after.select(*keys.STATE),
-        after[keys.TERMINATED],
-        after[keys.DONE],
-    )
-
-
-def _fill(
-    learner: FlashSACLearner, block: TensorDict, rows: int
-) -> dict[str, float | int]:
+def _fill(learner: FlashSACLearner, block: TensorDict, rows: int) -> dict[str, Any]:
     """Push until the ring is full, then once more around an eighth of it.
 
     The first pass takes fresh pages of memory, the second does what training does for
     ever after.
     """
-    device, found = learner.device, {}
+    found = {}
     for name, wanted in (("fresh", rows), ("written", max(PUSH, rows // 8))):
         learner.buffer.push(block)
         learner.buffer.flush()
         pushes = -(-wanted // PUSH)
-        begin = now(device)
+        begin = timer()
         for _ in range(pushes):
             learner.buffer.push(block)
         learner.buffer.flush()
-        spent = now(device) - begin
-        found[f"{name}_rows_per_s"] = round(pushes * PUSH / spent)
+        found[f"{name}_rows_per_s"] = round(pushes * PUSH / (timer() - begin))
     return found
 
 
 def count_of(text: str) -> int:
-    """A number of rows: ``50M``, ``200k`` or plain digits.
-
-    Args:
-        text: of the command line.
-    """
+    """A number of rows: ``50M``, ``200k`` or plain digits."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
     if match is None:
         raise argparse.ArgumentTypeError(f"'{text}' is no count: 50M, 200k or 4096")
     return int(float(match[1]) * {"": 1, "k": 1_000, "M": 1_000_000}[match[2]])
 
 
-def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.replay")
-    add_recipe_options(parser, recipe="quickstart")
+def _parse(words: Sequence[str]) -> argparse.Namespace:
+    parser = output.make_parser("replay", __doc__)
+    output.add_recipe_options(parser)
     parser.set_defaults(objects=2)
-    parser.add_argument(
-        "--rows", type=count_of, nargs="+", default=[100_000], help="100k, 1M ..."
-    )
-    parser.add_argument(
-        "--replay", choices=["auto", "device", "pinned", "cpu"], help="where they lie"
-    )
-    parser.add_argument(
-        "--batch", type=int, help="rows a sample; the recipe's if absent"
-    )
-    parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
+    add, places = parser.add_argument, ["auto", "device", "pinned", "cpu"]
+    add("--rows", type=count_of, nargs="+", default=[100_000], help="100k, 1M ...")
+    add("--replay", choices=places, help="where they lie")
+    add("--batch", type=int, help="rows a sample; the recipe's if absent")
+    add("--seconds", type=float, default=2.0, help="for each figure")
     return parser.parse_intermixed_args(words)
+
+
+if __name__ == "__main__":
+    output.run(main)

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import tarfile
 import time
 from pathlib import Path
 
 from benchmarks.common.library import bench_library
-from benchmarks.suite_parts import CURVE_LIBRARY
+from benchmarks.device_suite import CURVE_LIBRARY
 from flashdex.datasets.source import SourceOptions
 from flashdex.motions.pipeline.prepare import Order, run_order
 
@@ -26,12 +25,7 @@ CURVE_MOTIONS = 50
 
 
 def make_libraries(folder: Path, *, workers: int) -> dict[str, float]:
-    """Prepare what is missing; seconds by library.
-
-    Args:
-        folder: of the libraries.
-        workers: processes.
-    """
+    """Prepare what is missing with so many processes; seconds by library."""
     spent = {}
     for objects, hulls in SCENES:
         begin = time.perf_counter()
@@ -47,30 +41,12 @@ def make_libraries(folder: Path, *, workers: int) -> dict[str, float]:
 
 
 def pack(folder: Path, archive: Path) -> Path:
-    """Write the libraries into a compressed archive; pictures stay out.
-
-    Args:
-        folder: of the libraries.
-        archive: ``.tar.xz``.
-    """
+    """Write the libraries into a compressed archive; pictures stay out."""
     with tarfile.open(archive, "w:xz", preset=6) as file:
         for path in sorted(folder.iterdir()):
             if not path.name.endswith("-base"):
                 file.add(path, path.name)
     return archive
-
-
-def unpack(source: Path, folder: Path) -> Path:
-    """The folder of the libraries: as given, or unpacked into another one.
-
-    Args:
-        source: folder or archive.
-        folder: where an archive is unpacked.
-    """
-    if source.is_dir():
-        return source.resolve()
-    shutil.unpack_archive(source, folder, filter="data")
-    return folder.resolve()
 
 
 def main() -> None:

@@ -7,22 +7,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import torch
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "envs")]
-
-from reduced import reduced_library  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-from flashdex.envs.physics.config import PhysicsConfig  # noqa: E402
-from flashdex.envs.physics.make import make_physics  # noqa: E402
-from flashdex.envs.reference import ReferenceBank  # noqa: E402
-from flashdex.hands.spec import load_hand  # noqa: E402
+from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.envs.physics.make import make_physics
+from flashdex.envs.reference import ReferenceBank
+from flashdex.hands.spec import load_hand
+from tests.envs.reduced import reduced_library
 
 
 def time_engine(engine: str, num_envs: int, steps: int) -> dict[str, float | str]:
@@ -66,8 +61,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50)
     args = parser.parse_args()
     for engine in args.engines:
-        result = time_engine(engine, args.num_envs, args.steps)
-        sys.stdout.write(json.dumps(result) + "\n")
+        print(json.dumps(time_engine(engine, args.num_envs, args.steps)), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.train``: the whole training loop, and its parts alone.
+"""The whole training loop, and its parts alone.
 
 Physics alone and updates alone are measured in the same process before and after the
 loop, so that the loop's figures are shares of what was possible at that moment.
@@ -6,20 +6,20 @@ loop, so that the loop's figures are shares of what was possible at that moment.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch.utils.benchmark import timer
 
-from benchmarks.common.clock import memory_gb, now, reset_peak_memory
-from benchmarks.common.output import emit
+from benchmarks.common import output
+from benchmarks.common.ceilings import memory_gb, reset_peak_memory
 from benchmarks.common.turns import physics_rate, room_used
-from benchmarks.env import add_recipe_options, compose_bench, describe_bench
+from benchmarks.env import describe_bench
 from flashdex.recipe import Recipe
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.training.assemble import BASELINES, make_trainer
@@ -27,6 +27,7 @@ from flashdex.training.build import open_workbench
 from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too
+COPIED = ("updates_per_step", "bfloat16", "compile", "replay")  # of the algorithm
 # No certificates, films or checkpoints, an actor that steps from the start, and a loop
 # that learns from the first batches on.
 CHANGES = (
@@ -38,59 +39,48 @@ CHANGES = (
 )
 
 
-def main(words: list[str] | None = None) -> dict[str, Any]:
-    """Measure, and print one JSON object.
-
-    Args:
-        words: ``--seconds S``, ``--ceiling-seconds S``, the recipe's options and
-            ``key=value`` overrides.
-
-    Returns:
-        The printed object.
-    """
-    args = _parse(words or [])
-    recipe = _compose(args)
+def main(words: Sequence[str] = ()) -> dict[str, Any]:
+    """Measure, and print one JSON object; it is returned."""
+    parser = output.make_parser("train", __doc__)
+    output.add_recipe_options(parser)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of the loop")
+    parser.add_argument(
+        "--ceiling-seconds", type=float, default=4.0, help="of each part alone"
+    )
+    args = parser.parse_intermixed_args(words)
+    # learning from the first few batches of rows on
+    first = output.compose_bench(args, changes=(*CHANGES, "algo.min_buffer=1"))
+    rows = max(2 * first.algo.batch_size, 4 * first.env.num_envs)
+    least = f"algo.min_buffer={min(rows, first.algo.buffer_size)}"
+    recipe = output.compose_bench(args, changes=(*CHANGES, least))
     keep_freed_memory()
     if recipe.train.torch_threads:
         torch.set_num_threads(recipe.train.torch_threads)
     found = measure(recipe, seconds=args.seconds, ceiling_seconds=args.ceiling_seconds)
-    return emit(found, out=args.out)
-
-
-def _compose(args: argparse.Namespace) -> Recipe:
-    """The recipe, learning from the first few batches of rows on."""
-    first = compose_bench(
-        args, where="benchmarks.train", changes=(*CHANGES, "algo.min_buffer=1")
-    )
-    rows = max(2 * first.algo.batch_size, 4 * first.env.num_envs)
-    least = f"algo.min_buffer={min(rows, first.algo.buffer_size)}"
-    return compose_bench(args, where="benchmarks.train", changes=(*CHANGES, least))
+    return output.emit(found, out=args.out)
 
 
 def measure(
     recipe: Recipe, *, seconds: float, ceiling_seconds: float
 ) -> dict[str, Any]:
-    """Build a trainer as a run does and drive its vector step.
+    """Build a trainer of an off-policy learner as a run does; drive its vector step.
 
-    Args:
-        recipe: of an off-policy learner.
-        seconds: of the loop.
-        ceiling_seconds: of each part alone, before and after.
-
-    Returns:
-        Rates, milliseconds of the phases, shares of the ceilings, memory.
+    Each part alone is measured before and after.
     """
     with _open_trainer(recipe) as (trainer, described, built):
         device = trainer.learner.device
         reset_peak_memory(device)
-        td, warm = _warm_up(trainer)
+        warm = _warm_up(trainer)
         before = _ceilings(trainer, seconds=ceiling_seconds)
         td = _restart(trainer)
         loop = _loop(trainer, td, seconds=seconds)
         after = _ceilings(trainer, seconds=ceiling_seconds)
-        memory = memory_gb(device)
-        overflow = trainer.env.physics.take_overflow()
-        room, rows = room_used(trainer.env), trainer.learner.num_rows
+        left = {
+            "rows": trainer.learner.num_rows,
+            "overflow": trainer.env.physics.take_overflow(),
+            **room_used(trainer.env),
+            "memory_gb": memory_gb(device),
+        }
     physics, learner = (0.5 * (a + b) for a, b in zip(before, after, strict=True))
     rate, updates = loop["env_steps_per_s"], loop["updates_per_s"]
     worlds = recipe.env.num_envs
@@ -100,10 +90,7 @@ def measure(
         **described,
         "batch": recipe.algo.batch_size,
         "critic": recipe.algo.critic_width,
-        "updates_per_step": recipe.algo.updates_per_step,
-        "bfloat16": recipe.algo.bfloat16,
-        "compile": recipe.algo.compile,
-        "replay": recipe.algo.replay,
+        **{name: getattr(recipe.algo, name) for name in COPIED},
         **loop,
         "ceiling_physics_env_steps_per_s": round(physics, 1),
         "ceiling_updates_per_s": round(learner, 2),
@@ -116,10 +103,7 @@ def measure(
         "share_of_both": round(rate * alone / worlds, 4),
         "build_s": round(built, 2),
         "warm_up_s": round(warm, 2),
-        "rows": rows,
-        "overflow": overflow,
-        **room,
-        "memory_gb": memory,
+        **left,
         "torch_threads": torch.get_num_threads(),
     }
 
@@ -127,7 +111,7 @@ def measure(
 @contextmanager
 def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], float]]:
     """A trainer in a temporary run folder, what it is, and the seconds it took."""
-    begin = now(torch.device("cpu"))
+    begin = timer()
     bench = open_workbench(recipe)
     with tempfile.TemporaryDirectory(prefix="flashdex-bench-") as folder:
         # the baselines are scores of the collection, no part of the loop
@@ -137,20 +121,20 @@ def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], flo
         described = describe_bench(bench, trainer.env)
         try:
             with trainer.guard:
-                yield trainer, described, now(torch.device("cpu")) - begin
+                yield trainer, described, timer() - begin
         finally:
             trainer.alongside.close()
             trainer.judging.close(wait=False)
             trainer.log.close()
 
 
-def _warm_up(trainer: Trainer) -> tuple[TensorDictBase, float]:
-    """Vector steps until some updates are done: kernels, compilation, buffers."""
-    begin = now(trainer.learner.device)
+def _warm_up(trainer: Trainer) -> float:
+    """Seconds until some updates are done: kernels, compilation, buffers."""
+    begin = timer()
     td = _restart(trainer)
     while trainer.learner.updates < WARM_UPDATES:
         td = trainer.vector_step(td)
-    return td, now(trainer.learner.device) - begin
+    return timer() - begin
 
 
 def _restart(trainer: Trainer) -> TensorDictBase:
@@ -168,26 +152,26 @@ def _ceilings(trainer: Trainer, *, seconds: float) -> tuple[float, float]:
     physics = physics_rate(trainer.env, seconds=seconds)
     learner = trainer.learner
     updates = learner.updates
-    begin = end = now(learner.device)
+    begin = end = timer()
     while end - begin < seconds or learner.updates < updates + 2:
         for _ in range(8):
             for _ in range(learner.due()):  # as the loop asks: samples come together
                 learner.update()
-        end = now(learner.device)
+        end = timer()
     return physics, (learner.updates - updates) / (end - begin)
 
 
 def _loop(trainer: Trainer, td: TensorDictBase, *, seconds: float) -> dict[str, Any]:
     """Drive the loop; the device is waited for at the end of a block of steps."""
-    device, worlds = trainer.learner.device, trainer.env.num_envs
+    worlds = trainer.env.num_envs
     trainer.stats.pop(1.0, worlds)
     steps, updates = trainer.env_steps, trainer.learner.updates
-    begin = end = now(device)
+    begin = end = timer()
     block = 1
     while end - begin < seconds:
         for _ in range(block):
             td = trainer.vector_step(td)
-        end = now(device)
+        end = timer()
         block = min(2 * block, 64)
     spent = end - begin
     phases = trainer.stats.pop(spent, worlds)
@@ -201,11 +185,5 @@ def _loop(trainer: Trainer, td: TensorDictBase, *, seconds: float) -> dict[str, 
     }
 
 
-def _parse(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.train")
-    add_recipe_options(parser, recipe="quickstart")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the loop")
-    parser.add_argument(
-        "--ceiling-seconds", type=float, default=4.0, help="of each part alone"
-    )
-    return parser.parse_intermixed_args(words)
+if __name__ == "__main__":
+    output.run(main)

@@ -2,32 +2,60 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.profiler_util import FunctionEvent
-from torch.profiler import ProfilerActivity, profile
+from torch.utils.benchmark import Timer
+from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.common.clock import now, seconds_each
 from flashdex.modules.product import multiply
 
 GPU_SIDES = (4096, 8192)
 CPU_SIDES = (1024, 2048)
 
 
+def seconds_each(call: Callable[[], object], *, seconds: float) -> float:
+    """Seconds of one call, from as many calls as fit into some seconds.
+
+    The first calls are not counted, and a GPU is waited for after blocks of calls only.
+    """
+    threads = torch.get_num_threads()
+    clock = Timer("call()", globals={"call": call}, num_threads=threads)
+    return clock.blocked_autorange(min_run_time=max(seconds, 1e-9)).mean
+
+
+def memory_gb(device: torch.device) -> dict[str, float]:
+    """Memory in GB (1e9 bytes): the host's peak, torch's peak, all of the device.
+
+    Returns:
+        ``host_peak``; on a GPU also ``torch_peak`` and ``device_used``, which is what
+        all processes and libraries hold at this moment, warp's arrays included.
+    """
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = {"host_peak": peak * (1 if sys.platform == "darwin" else 1024)}
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        found["torch_peak"] = torch.cuda.max_memory_reserved(device)
+        found["device_used"] = total - free
+    return {name: round(number / 1e9, 3) for name, number in found.items()}
+
+
+def reset_peak_memory(device: torch.device) -> None:
+    """Begin to look for the peak of torch's memory on a GPU anew."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
 @contextmanager
 def float32_products(precision: str) -> Iterator[None]:
-    """Run the block with float32 products in TF32 (``high``) or full (``highest``).
-
-    Args:
-        precision: of ``torch.set_float32_matmul_precision``.
-    """
+    """Run the block with float32 products in TF32 (``high``) or full (``highest``)."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision)
     try:
@@ -37,38 +65,20 @@ def float32_products(precision: str) -> Iterator[None]:
 
 
 def matmul_gflops(device: torch.device, dtype: torch.dtype, *, seconds: float) -> float:
-    """Best rate of a square matrix product on random numbers, GFLOP/s.
-
-    Args:
-        device: where.
-        dtype: of operands and result.
-        seconds: for each size.
-    """
+    """Best rate of a square matrix product on random numbers, GFLOP/s, each size."""
     best = 0.0
     for side in GPU_SIDES if device.type == "cuda" else CPU_SIDES:
         left = torch.randn(1, side, side, device=device, dtype=dtype)
         right = torch.randn(1, side, side, device=device, dtype=dtype)
-        each = seconds_each(_product(left, right), device, seconds=seconds)
+        # float32 by the library's own path: oneDNN on a CPU
+        call = multiply if dtype == torch.float32 else torch.bmm
+        each = seconds_each(lambda: call(left, right), seconds=seconds)  # noqa: B023
         best = max(best, 2 * side**3 / each / 1e9)
     return round(best, 1)
 
 
-def _product(left: Tensor, right: Tensor) -> Callable[[], Tensor]:
-    if left.dtype == torch.float32:  # the library's own path: oneDNN on a CPU
-        return lambda: multiply(left, right)
-    return lambda: torch.bmm(left, right)
-
-
 def matmul_ceilings(device: torch.device, *, seconds: float = 0.5) -> dict[str, float]:
-    """Rates of the number formats a learner may use, GFLOP/s.
-
-    Args:
-        device: where.
-        seconds: for each format and size.
-
-    Returns:
-        ``float32`` and ``bfloat16``, on a GPU also ``tf32``.
-    """
+    """GFLOP/s of ``float32`` and ``bfloat16`` products, on a GPU also ``tf32``."""
     with float32_products("highest"):
         rates = {"float32": matmul_gflops(device, torch.float32, seconds=seconds)}
     if device.type == "cuda":
@@ -87,15 +97,9 @@ def gather_seconds(
     device: torch.device,
     seconds: float,
 ) -> float:
-    """Seconds to gather random rows of one wide table and have them on the device.
+    """Seconds to gather a batch of random rows of one table and have them on a device.
 
-    Args:
-        rows: of the table; all of them are written first.
-        width: bytes of a row.
-        batch: rows gathered.
-        kept_on: where the table lies.
-        device: where the rows are wanted.
-        seconds: how long to measure.
+    The table of so many rows, each ``width`` bytes, is written first.
     """
     # gathers move whole numbers: eight bytes each
     table = torch.ones(rows, -(-width // 8), dtype=torch.int64, device=kept_on)
@@ -104,38 +108,20 @@ def gather_seconds(
         index = torch.randint(rows, (batch,), device=kept_on)
         return table.index_select(0, index).to(device)
 
-    return seconds_each(gather, device, seconds=seconds)
+    return seconds_each(gather, seconds=seconds)
 
 
 def copy_gb_per_s(
     device: torch.device, *, num_bytes: int, seconds: float = 0.5
 ) -> float:
-    """Bytes read plus bytes written by a plain copy, GB/s.
-
-    Args:
-        device: where.
-        num_bytes: of the tensor; several times the largest cache.
-        seconds: how long to measure.
-    """
+    """Bytes read plus bytes written by a plain copy of so many bytes, GB/s."""
     source = torch.ones(num_bytes // 8, dtype=torch.int64, device=device)
     target = torch.empty_like(source)
-    now(device)
-    each = seconds_each(lambda: target.copy_(source), device, seconds=seconds)
+    each = seconds_each(lambda: target.copy_(source), seconds=seconds)
     return round(2 * num_bytes / each / 1e9, 1)
 
 
-# operand positions of the products among the inputs of each operator
-_OPERANDS = {
-    "aten::mm": (0, 1),
-    "aten::bmm": (0, 1),
-    "aten::addmm": (1, 2),
-    "aten::baddbmm": (1, 2),
-    "mkldnn::_linear_pointwise": (0, 1),
-}
-
-
-@dataclass(frozen=True)
-class Product:
+class Product(NamedTuple):
     """E products of (rows, inner) by (inner, columns)."""
 
     members: int
@@ -152,21 +138,28 @@ class Product:
 def count_products(
     call: Callable[[], object], *, repeat: int = 1
 ) -> dict[Product, float]:
-    """How often each product runs in one call.
+    """How often each product runs in one call, gradients included; mean of some."""
+    counts: Counter[Product] = Counter()
 
-    The profiler gives their shapes only: its own records scatter the heap, and the
-    page faults that follow make every other operator look slower than it is.
+    def of(first: int, *, columns: int = -1) -> Callable[..., int]:
+        def note(*shapes: Any, **_: Any) -> int:
+            left, right = shapes[first : first + 2]
+            members = left[0] if len(left) == 3 else 1
+            found = Product(members, left[-2], left[-1], right[columns])
+            counts[found] += 1
+            return found.flops
 
-    Args:
-        call: what to look at.
-        repeat: calls.
-    """
-    with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as found:
+        return note
+
+    aten = torch.ops.aten
+    formulas = {aten.mm: of(0), aten.bmm: of(0), aten.addmm: of(1), aten.baddbmm: of(1)}
+    if hasattr(torch.ops.mkldnn, "_linear_pointwise"):
+        # not known to torch's counter; the weight is (columns, inner)
+        formulas[torch.ops.mkldnn._linear_pointwise] = of(0, columns=0)
+    with FlopCounterMode(display=False, custom_mapping=formulas):
         for _ in range(repeat):
             call()
-    events = found.events() or []
-    counts = Counter(_read(event) for event in events if event.name in _OPERANDS)
-    return {product: number / repeat for product, number in counts.items()}
+    return {found: number / repeat for found, number in counts.items()}
 
 
 def total_flops(counts: dict[Product, float]) -> float:
@@ -174,46 +167,23 @@ def total_flops(counts: dict[Product, float]) -> float:
     return sum(product.flops * count for product, count in counts.items())
 
 
-def _read(event: FunctionEvent) -> Product:
-    shapes: Any = event.input_shapes
-    left, right = (shapes[i] for i in _OPERANDS[event.name])
-    members = left[0] if len(left) == 3 else 1
-    # a linear layer is given its weight as (columns, inner)
-    columns = right[0] if event.name.startswith("mkldnn") else right[-1]
-    return Product(members, left[-2], left[-1], columns)
-
-
 def replay_seconds(
-    counts: dict[Product, float],
-    *,
-    repeat: int,
-    device: torch.device | str = "cpu",
+    counts: dict[Product, float], *, repeat: int, device: torch.device | str = "cpu"
 ) -> float:
     """Seconds that the products of one call take by themselves, each in a tight loop.
 
-    Args:
-        counts: the products.
-        repeat: runs of each product; the median counts. On a GPU they run in one row,
-            and the mean counts.
-        device: where.
+    The median of ``repeat`` runs counts; on a GPU they run in one row, and the mean.
     """
     device, total = torch.device(device), 0.0
-    for product, count in counts.items():
-        left = torch.randn(product.members, product.rows, product.inner, device=device)
-        right = torch.randn(
-            product.members, product.columns, product.inner, device=device
-        )
-        total += count * _seconds_of(left, right, repeat=repeat)
-    return total
-
-
-def _seconds_of(left: Tensor, right: Tensor, *, repeat: int) -> float:
-    device, times = left.device, []
     in_a_row = 1 if device.type == "cpu" else 10 * repeat
-    multiply(left, right)
-    for _ in range(repeat if in_a_row == 1 else 1):
-        start = now(device)
-        for _ in range(in_a_row):
-            multiply(left, right)
-        times.append((now(device) - start) / in_a_row)
-    return median(times)
+    for (members, rows, inner, columns), count in counts.items():
+        left = torch.randn(members, rows, inner, device=device)
+        right = torch.randn(members, columns, inner, device=device)
+        clock = Timer(
+            "multiply(left, right)",
+            globals={"multiply": multiply, "left": left, "right": right},
+            num_threads=torch.get_num_threads(),
+        )
+        runs = range(repeat if in_a_row == 1 else 1)
+        total += count * median(clock.timeit(in_a_row).mean for _ in runs)
+    return total

@@ -24,19 +24,8 @@ Vertices = NDArray[np.float64]
 def cut_hull(vertices: NDArray[np.floating], count: int) -> list[Vertices]:
     """Cut a convex body into parts that touch and do not overlap.
 
-    The largest part is cut across its longest side until there are enough.
-
-    Args:
-        vertices: of the body, m, (V, 3).
-        count: parts wanted.
-
-    Returns:
-        Vertices of each part, m, each (V, 3), largest volume first.
-
-    Example:
-        >>> box = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 2)])
-        >>> [len(part) for part in cut_hull(box, 2)]
-        [8, 8]
+    The largest part is cut across its longest side until there are enough: vertices of
+    each part, m, (V, 3), largest volume first.
     """
     tie = itertools.count()  # arrays cannot be compared
     first = _corners(np.asarray(vertices, np.float64))
@@ -69,7 +58,6 @@ def _crossings(vertices: Vertices, height: NDArray[np.float64]) -> Vertices:
 
 
 def _corners(vertices: Vertices) -> Vertices:
-    """Vertices of the hull, each once."""
     return vertices[ConvexHull(vertices).vertices]
 
 
@@ -85,15 +73,8 @@ def bench_library(objects: int, hulls: int, *, folder: Path | None = None) -> Pa
     """Make, once, a procedural collection of two motions, and return its folder.
 
     The motions, their references and their physics are the same for every number of
-    hulls: the convex bodies of the objects are only cut into more parts.
-
-    Args:
-        objects: objects a motion, 1 or 2; two objects are carried by two hands.
-        hulls: convex parts of each object, 1 to 16.
-        folder: where libraries are kept; ``bench`` in the cache when None.
-
-    Raises:
-        FlashdexError: numbers that cannot be made.
+    hulls: the convex bodies of the objects are only cut into more parts. Two objects a
+    motion are carried by two hands. The folder is ``bench`` in the cache when None.
     """
     if objects not in KINDS or not 1 <= hulls <= MAX_HULLS:
         raise FlashdexError(
@@ -120,13 +101,7 @@ def _is_usable(path: Path) -> bool:
 
 
 def recut_library(library: MotionLibrary, hulls: int, path: Path) -> MotionLibrary:
-    """Write a library anew, every object cut into a number of convex parts.
-
-    Args:
-        library: of convex objects.
-        hulls: parts of each object.
-        path: where the new one goes; an older library there is replaced.
-    """
+    """Write a library of convex objects anew, each cut into a number of parts."""
     manifest = {"source": "bench", "hulls": hulls}
     writer = LibraryWriter(path, hand=library.hand, fps=library.fps, manifest=manifest)
     assets = [_recut(library, row, hulls) for row in range(len(library.objects))]
@@ -175,14 +150,7 @@ def _recut(library: MotionLibrary, row: int, hulls: int) -> ObjectAsset:
 
 
 def describe_scene(library: MotionLibrary) -> dict[str, Any]:
-    """Size of a collection as the engines see it.
-
-    Args:
-        library: the collection.
-
-    Returns:
-        ``motions``, ``objects`` of a world and ``hulls`` of each object slot.
-    """
+    """``motions``, ``objects`` of a world and ``hulls`` of each object slot."""
     rows = library.motions["object_index"].long()
     slots = (rows >= 0).any(0).nonzero().squeeze(-1).tolist()
     counts = {r: len(library.parts(r)) for r in rows.unique().tolist() if r >= 0}

@@ -1,242 +1,187 @@
-"""The FlashSAC update in its plainest form, the yardstick of the learner benchmark."""
+"""FlashSAC in its plainest form: the benchmark's yardstick and the tests' oracle.
+
+Written from the equations and not from the package. There is no ensemble axis: every
+tower and every critic is a stack of torch's own layers, and groups, members and
+parameters are visited in Python loops.
+"""
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
 
-NUM_ATOMS, V_MAX = 101, 5.0
+from flashdex.modules.actor import FlashActor
+from flashdex.modules.critic import EnsembleCritic
+from flashdex.modules.future import FutureEncoder
+from flashdex.modules.layers import UnitBatchNorm
+from flashdex.objectives.flashsac import FlashSACLoss
+
+Source = FlashActor | EnsembleCritic
 
 
-class PlainBatchNorm(nn.Module):
-    """BatchNorm of (B, d) whose mode is an argument of the call.
-
-    Args:
-        features: size d.
-    """
-
-    mean: Tensor
-    var: Tensor
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(features))
-        self.bias = nn.Parameter(torch.zeros(features))
-        self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("var", torch.ones(features))
-
-    def forward(self, x: Tensor, *, training: bool) -> Tensor:
-        """Normalise ``x``; training moves the running statistics by 0.01."""
-        return functional.batch_norm(
-            x, self.mean, self.var, self.weight, self.bias, training, 0.01, 1e-5
-        )
+def batch_norm(features: int) -> nn.BatchNorm1d:
+    """BatchNorm with momentum 0.01 and eps 1e-5."""
+    norm = nn.BatchNorm1d(features, momentum=0.01)
+    norm.num_batches_tracked = None  # nothing reads the count
+    return norm
 
 
 class PlainBlock(nn.Module):
-    """``x + relu(BN(W2 relu(BN(W1 x))))``.
-
-    Args:
-        width: size of the residual stream.
-    """
+    """``x + relu(BN(W2 relu(BN(W1 x))))``, W1: d -> 4d, W2: 4d -> d."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.linear1 = nn.Linear(width, 4 * width, bias=False)
-        self.norm1 = PlainBatchNorm(4 * width)
-        self.linear2 = nn.Linear(4 * width, width, bias=False)
-        self.norm2 = PlainBatchNorm(width)
+        layers: list[nn.Module] = []
+        for inputs, outputs in ((width, 4 * width), (4 * width, width)):
+            linear = nn.Linear(inputs, outputs, bias=False)
+            layers += [linear, batch_norm(outputs), nn.ReLU()]
+        self.body = nn.Sequential(*layers)
 
-    def forward(self, x: Tensor, *, training: bool) -> Tensor:
-        """Transform ``x`` (B, width)."""
-        y = functional.relu(self.norm1(self.linear1(x), training=training))
-        return x + functional.relu(self.norm2(self.linear2(y), training=training))
-
-
-class PlainTrunk(nn.Module):
-    """BatchNorm, linear map, blocks and one RMSNorm.
-
-    Args:
-        inputs: width of the input.
-        width: size of the residual stream.
-        num_blocks: residual blocks.
-    """
-
-    def __init__(self, inputs: int, width: int, num_blocks: int = 2) -> None:
-        super().__init__()
-        self.norm_in = PlainBatchNorm(inputs)
-        self.embed = nn.Linear(inputs, width, bias=False)
-        self.blocks = nn.ModuleList(PlainBlock(width) for _ in range(num_blocks))
-        self.rms = nn.RMSNorm(width, eps=1e-6)
-
-    def forward(self, x: Tensor, *, training: bool) -> Tensor:
-        """Features (B, width) of ``x`` (B, inputs)."""
-        x = self.embed(self.norm_in(x, training=training))
-        for block in self.blocks:
-            x = block(x, training=training)
-        return self.rms(x)
+    def forward(self, x: Tensor) -> Tensor:
+        """Transform ``x`` (B, d)."""
+        return x + self.body(x)
 
 
 class PlainEncoder(nn.Module):
-    """Three temporal convolutions with SiLU and a linear read-out.
+    """Three temporal convolutions with SiLU and a linear read-out: (B, C, K) to (B, d).
 
-    Args:
-        channels: features of one frame.
-        num_frames: frames of the window.
-        latent: size of the output.
-        widths: output channels of the convolutions.
+    The sizes are the channels C and the widths of the convolutions.
     """
 
-    def __init__(
-        self, channels: int, num_frames: int, latent: int, widths: tuple[int, int, int]
-    ) -> None:
+    def __init__(self, sizes: Sequence[int], inputs: int, latent: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv1d(channels, widths[0], 1)
-        self.conv2 = nn.Conv1d(widths[0], widths[1], 4, stride=2)
-        self.conv3 = nn.Conv1d(widths[1], widths[2], 2)
-        length = (num_frames - 4) // 2
-        self.read_out = nn.Linear(length * widths[2], latent)
+        layers: list[nn.Module] = []
+        for i, (kernel, stride) in enumerate(((1, 1), (4, 2), (2, 1))):
+            layers += [nn.Conv1d(sizes[i], sizes[i + 1], kernel, stride), nn.SiLU()]
+        self.convolutions = nn.Sequential(*layers)
+        self.read_out = nn.Linear(inputs, latent)
 
     def forward(self, future: Tensor) -> Tensor:
-        """Encode (B, channels, num_frames) to (B, latent)."""
-        x = functional.silu(self.conv1(future))
-        x = functional.silu(self.conv2(x))
-        x = functional.silu(self.conv3(x))
-        return self.read_out(x.mT.flatten(1))
+        """Encode a window of frames."""
+        return self.read_out(self.convolutions(future).mT.flatten(1))
 
 
-class PlainActor(nn.Module):
-    """One policy tower with the centred head.
+class PlainNetworks(nn.Module):
+    """Separate networks that see the same observation and encoded window.
 
-    Args:
-        inputs: width of the observation, latent included.
-        action_dim: actions A.
-        width: residual stream.
-        encoder: of the future window, or None.
+    Each is BatchNorm, linear map, blocks, RMSNorm and head, copied from a member of
+    stacked networks, as is the encoder; unit heads are projected, too.
     """
 
     def __init__(
-        self, inputs: int, action_dim: int, width: int, encoder: PlainEncoder | None
+        self, source: Source, members: Iterable[int], *, encoder: int, unit_heads: bool
     ) -> None:
         super().__init__()
-        self.encoder = encoder
-        self.trunk = PlainTrunk(inputs, width)
-        self.mean_head = nn.Linear(width, action_dim)
-        self.std_head = nn.Linear(width, action_dim)
+        self.unit_heads = unit_heads
+        self.encoder = None
+        if source.future_encoder is not None:
+            self.encoder = _copy_encoder(source.future_encoder, encoder)
+        self.nets = nn.ModuleList(_copy_network(source, member) for member in members)
 
-    def forward(
-        self, observation: Tensor, future: Tensor | None, *, training: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Mean and std, (B, A) each."""
-        x = join(observation, self.encoder, future)
-        x = self.trunk(x, training=training)
-        log_std = -5.0 + 2.5 * (1.0 + torch.tanh(self.std_head(x)))
-        return self.mean_head(x), log_std.exp()
+    def see(self, observation: Tensor, future: Tensor | None) -> Tensor:
+        """Observation (B, D) with the latent of the window behind it."""
+        if self.encoder is None:
+            return observation
+        return torch.cat([observation, self.encoder(future)], -1)
 
-
-class PlainCritics(nn.Module):
-    """Twin critics of all groups as separate networks over one shared encoder.
-
-    Args:
-        inputs: width of observation, latent and joint action together.
-        width: residual stream.
-        num_groups: groups G.
-        encoder: of the future window, or None.
-    """
-
-    def __init__(
-        self, inputs: int, width: int, num_groups: int, encoder: PlainEncoder | None
-    ) -> None:
-        super().__init__()
-        self.encoder = encoder
-        count = 2 * num_groups
-        self.trunks = nn.ModuleList(PlainTrunk(inputs, width) for _ in range(count))
-        self.heads = nn.ModuleList(nn.Linear(width, NUM_ATOMS) for _ in range(count))
-
-    def observe(self, observation: Tensor, future: Tensor | None) -> Tensor:
-        """Observation and latent side by side: the same for all members."""
-        return join(observation, self.encoder, future)
-
-    def member(
-        self, index: int, seen: Tensor, action: Tensor, *, training: bool
-    ) -> Tensor:
-        """Log-probabilities (B, Z) of member ``2 group + twin``."""
-        x = torch.cat([seen, action], -1)
-        x = self.trunks[index](x, training=training)
-        return functional.log_softmax(self.heads[index](x), -1)
-
-
-def join(
-    observation: Tensor, encoder: PlainEncoder | None, future: Tensor | None
-) -> Tensor:
-    """Observation with the latent of the window behind it."""
-    if encoder is None:
-        return observation
-    assert future is not None
-    return torch.cat([observation, encoder(future)], -1)
+    @torch.no_grad()
+    def project_(self) -> None:
+        """Unit rows; norm sqrt(d) of gamma and beta together, and of the RMS scale."""
+        for layer in self.nets.modules():
+            if isinstance(layer, nn.Linear):
+                if layer.bias is None or self.unit_heads:
+                    norm = layer.weight.norm(dim=-1, keepdim=True)
+                    layer.weight.div_(norm.clamp_min(1e-8))
+            elif isinstance(layer, nn.BatchNorm1d | nn.RMSNorm):
+                total = sum(p.square().sum() for p in layer.parameters()) + 1e-8
+                for parameter in layer.parameters():
+                    parameter.mul_(len(parameter) ** 0.5 * torch.rsqrt(total))
 
 
 @torch.no_grad()
-def project(module: nn.Module, unit_heads: Iterable[nn.Linear] = ()) -> None:
-    """Unit rows, joint norm sqrt(d) of gamma and beta, norm sqrt(d) of the RMS scale.
+def _copy_network(source: Source, member: int) -> nn.Sequential:
+    """Both list their parameters in the order of the data."""
+    trunk, head = source.trunk, source.head.weight
+    outputs, width = head.shape[1:]
+    inputs = trunk.embed.linear.weight.shape[-1]
+    net = nn.Sequential(
+        batch_norm(inputs),
+        nn.Linear(inputs, width, bias=False),
+        *(PlainBlock(width) for _ in trunk.blocks),
+        nn.RMSNorm(width, eps=1e-6),
+        nn.Linear(width, outputs),
+    ).to(head)
+    wanted = [*trunk.parameters(), head, source.head_bias]
+    for mine, other in zip(net.parameters(), wanted, strict=True):
+        mine.copy_(other[member])
+    mine = [x for x in net.modules() if isinstance(x, nn.BatchNorm1d)]
+    theirs = [x for x in trunk.modules() if isinstance(x, UnitBatchNorm)]
+    for norm, other in zip(mine, theirs, strict=True):
+        norm.running_mean = other.running_mean[member].clone()
+        norm.running_var = other.running_var[member].clone()
+    return net
 
-    Args:
-        module: network whose trunks are projected.
-        unit_heads: linear maps outside of the trunks with unit rows.
-    """
-    linears = list(unit_heads)
-    for part in module.modules():
-        if isinstance(part, PlainTrunk):
-            linears.append(part.embed)
-        elif isinstance(part, nn.RMSNorm):
-            scale = part.weight
-            scale.mul_(len(scale) ** 0.5 * torch.rsqrt(scale.square().sum() + 1e-8))
-        elif isinstance(part, PlainBlock):
-            linears += [part.linear1, part.linear2]
-        elif isinstance(part, PlainBatchNorm):
-            total = part.weight.square().sum() + part.bias.square().sum()
-            factor = len(part.weight) ** 0.5 * torch.rsqrt(total + 1e-8)
-            part.weight.mul_(factor)
-            part.bias.mul_(factor)
-    for linear in linears:
-        weight = linear.weight
-        weight.div_(weight.norm(dim=-1, keepdim=True).clamp_min(1e-8))
+
+@torch.no_grad()
+def _copy_encoder(source: FutureEncoder, member: int) -> PlainEncoder:
+    weights = [weight[member] for weight in source.weights]
+    sizes = [weights[0].shape[1], *(len(weight) for weight in weights[:3])]
+    encoder = PlainEncoder(sizes, weights[3].shape[1], len(weights[3])).to(weights[0])
+    biases = [bias[member] for bias in source.biases]
+    wanted = [x for pair in zip(weights, biases, strict=True) for x in pair]
+    for mine, other in zip(encoder.parameters(), wanted, strict=True):
+        mine.copy_(other.view_as(mine))
+    return encoder
 
 
 @dataclass(frozen=True)
 class PlainBatch:
-    """B transitions as one would lay them out for this learner.
+    """B transitions as one would lay them out for this learner."""
 
-    Attributes:
-        observation: (B, D).
-        next_observation: (B, D).
-        future: (B, C, K), or None.
-        next_future: (B, C, K), or None.
-        action: joint action, (B, G A).
-        reward: one (B,) a group.
-        discount: (B,).
-        terminated: 0 or 1, (B,).
-    """
-
-    observation: Tensor
+    observation: Tensor  # (B, D)
     next_observation: Tensor
-    future: Tensor | None
+    future: Tensor | None  # (B, C, K)
     next_future: Tensor | None
-    action: Tensor
-    reward: list[Tensor]
-    discount: Tensor
-    terminated: Tensor
+    action: Tensor  # joint action, (B, G A)
+    reward: list[Tensor]  # one (B,) a group
+    discount: Tensor  # gamma^k, (B,)
+    terminated: Tensor  # 0 or 1, (B,)
+    valid: list[Tensor] | None  # rows in which each group takes part; None is all
 
-    def futures(self) -> Tensor | None:
-        """Both windows one after the other, (2B, C, K), or None."""
+    def both(self) -> tuple[Tensor, Tensor | None]:
+        """Rows of s above those of s': observations (2B, D), windows (2B, C, K)."""
+        seen = torch.cat([self.observation, self.next_observation])
         if self.future is None or self.next_future is None:
-            return None
-        return torch.cat([self.future, self.next_future])
+            return seen, None
+        return seen, torch.cat([self.future, self.next_future])
+
+
+def read_batch(td: TensorDictBase, loss: FlashSACLoss) -> PlainBatch:
+    """What the plain learner reads of a batch, not through the package."""
+    after = td.get("next")
+    groups = [() if group is None else (group,) for group in loss.groups]
+    steps = td.get("steps", torch.full((len(td),), loss.n_steps)).flatten()
+    has_future = loss.qvalue_network.future_encoder is not None
+    mask = td.get("group_mask", None)
+    observation = td.get("observation")
+    return PlainBatch(
+        observation=observation,
+        next_observation=after["observation"],
+        future=td["future"] if has_future else None,
+        next_future=after["future"] if has_future else None,
+        action=torch.cat([td[(*group, "action")] for group in groups], -1),
+        reward=[after[(*group, "reward")].squeeze(-1) for group in groups],
+        discount=(loss.gamma ** steps.to(observation)),
+        terminated=after["terminated"].squeeze(-1).to(observation),
+        valid=None if mask is None else [m.nonzero().flatten() for m in mask.mT],
+    )
 
 
 def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,44 +192,44 @@ def sample_action(mean: Tensor, std: Tensor, noise: Tensor) -> tuple[Tensor, Ten
     return torch.tanh(u), log_prob.sum(-1)
 
 
-class PlainLearner:
+class PlainLearner(nn.Module):
     """Separate networks, Python loops over groups, members and parameters.
 
-    Args:
-        actors: one tower a group.
-        critics: twins of all groups.
-        action_dim: actions of one group.
-        lr: learning rate.
+    It starts from the present state of a loss of joint-action twin critics.
     """
 
-    def __init__(
-        self,
-        actors: list[PlainActor],
-        critics: PlainCritics,
-        *,
-        action_dim: int,
-        lr: float = 3e-4,
-    ) -> None:
-        self.actors = nn.ModuleList(actors)
-        self.critics = critics
-        self.target = copy.deepcopy(critics).requires_grad_(False)
-        self.num_groups = len(actors)
-        self.log_alpha = nn.Parameter(torch.full((len(actors),), 0.01).log())
-        self.target_entropy = (
-            0.5 * action_dim * math.log(2 * math.pi * math.e * 0.15**2)
+    atoms: Tensor
+
+    def __init__(self, loss: FlashSACLoss, *, lr: float = 3e-4) -> None:
+        super().__init__()
+        actor, critic = loss.actor_network, loss.qvalue_network
+        self.groups = range(len(loss.groups))
+        unit = actor.head_kind == "unit"
+        self.actors = nn.ModuleList(
+            PlainNetworks(actor, [g], encoder=g, unit_heads=unit) for g in self.groups
         )
-        self.atoms = torch.linspace(-V_MAX, V_MAX, NUM_ATOMS)
+        # layout [group, member]
+        critics: dict[str, Any] = {"encoder": 0, "unit_heads": True}
+        members = range(2 * len(self.groups))
+        self.critics = PlainNetworks(critic, members, **critics)
+        slow = loss.target_qvalue_network
+        self.target = PlainNetworks(slow, members, **critics).requires_grad_(False)
+        self.log_alpha = nn.Parameter(loss.log_alpha.detach().clone())
+        self.log_std_range = actor.log_std_range
+        self.target_entropy, self.gate = loss.target_entropy, loss.own_action_gate
+        end, count = critic.v_max, critic.num_atoms
+        atoms = torch.linspace(-end, end, count, dtype=torch.float64)
+        self.register_buffer("atoms", atoms.to(self.log_alpha))
         self.actor_adam = torch.optim.Adam(self.actors.parameters(), lr=lr)
         self.alpha_adam = torch.optim.Adam([self.log_alpha], lr=lr)
         self.critic_adam = torch.optim.Adam(self.critics.parameters(), lr=lr)
         self.updates = 0
 
-    def compile(self) -> None:
-        """Compile every trunk, where nearly all the time goes."""
-        for network in (self.actors, self.critics, self.target):
-            for part in network.modules():
-                if isinstance(part, PlainTrunk):
-                    part.compile()
+    def compile_networks(self) -> None:
+        """Compile every network, where nearly all the time goes."""
+        for part in (*self.actors, self.critics, self.target):
+            for net in part.nets:
+                net.compile()
 
     def update(
         self, batch: PlainBatch, *, actor_noise: Tensor, target_noise: Tensor
@@ -292,116 +237,116 @@ class PlainLearner:
         """One update with noise (G, B, A) each.
 
         Returns:
-            ``loss_qvalue`` (), and with an actor step ``loss_actor`` () and ``alpha``
-            before it, (G,).
+            Values of each group, (G,): ``loss_qvalue``, and with an actor step
+            ``loss_actor``, ``entropy`` and ``alpha`` before it.
         """
-        losses: dict[str, Tensor] = {}
+        report: dict[str, Tensor] = {}
         if self.updates % 2 == 0:
-            losses["loss_actor"], entropy = self._actor_step(batch, actor_noise)
-            self.alpha_adam.zero_grad()
+            report = self._actor_step(batch, actor_noise)
             alpha = self.log_alpha.exp()
-            (alpha * (entropy - self.target_entropy)).sum().backward()
-            losses["alpha"] = alpha.detach()
-            self.alpha_adam.step()
-        losses["loss_qvalue"] = self._critic_step(batch, target_noise)
+            report["alpha"] = alpha.detach()
+            excess = report["entropy"] - self.target_entropy
+            _step(self.alpha_adam, (alpha * excess).sum())
+        report["loss_qvalue"] = self._critic_step(batch, target_noise)
+        pairs = zip(self.target.parameters(), self.critics.parameters(), strict=True)
         with torch.no_grad():
-            pairs = zip(
-                self.target.parameters(), self.critics.parameters(), strict=True
-            )
             for slow, fast in pairs:
                 slow.lerp_(fast, 0.01)
         self.updates += 1
-        return losses
+        return report
 
-    def _actor_step(self, batch: PlainBatch, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def _policy(
+        self, actor: Any, observation: Tensor, future: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        mean, raw = actor.nets[0](actor.see(observation, future)).chunk(2, -1)
+        low, high = self.log_std_range
+        return mean, torch.exp(low + (high - low) * (1 + torch.tanh(raw)) / 2)
+
+    def _mean(self, values: Tensor, batch: PlainBatch, group: int) -> Tensor:
+        """Mean of (B,) over the rows that count."""
+        return (values if batch.valid is None else values[batch.valid[group]]).mean()
+
+    def _actor_step(self, batch: PlainBatch, noise: Tensor) -> dict[str, Tensor]:
         size = len(batch.observation)
-        both = torch.cat([batch.observation, batch.next_observation])
-        futures = batch.futures()
-        actions, log_probs = [], []
-        for actor, eps in zip(self.actors, noise, strict=True):
-            mean, std = actor(both, futures, training=True)
-            action, log_prob = sample_action(mean[:size], std[:size], eps)
-            actions.append(action)
-            log_probs.append(log_prob)
-        self.critics.requires_grad_(False)
-        seen = self.critics.observe(batch.observation, batch.future)
-        loss = torch.zeros(())
-        for group in range(self.num_groups):
-            joint = torch.cat(
-                [a if g == group else a.detach() for g, a in enumerate(actions)], -1
-            )
-            value = self._least_value(self.critics, group, seen, joint)
-            alpha = self.log_alpha[group].detach().exp()
-            loss = loss + (alpha * log_probs[group] - value).mean()
-        self.actor_adam.zero_grad()
-        loss.backward()
-        self.actor_adam.step()
+        drawn = []
+        for actor, eps in zip(self.actors.train(), noise, strict=True):
+            mean, std = self._policy(actor, *batch.both())
+            drawn.append(sample_action(mean[:size], std[:size], eps))
+        self.critics.requires_grad_(False).eval()
+        seen = self.critics.see(batch.observation, batch.future)
+        losses, entropies = [], []
+        for group in self.groups:
+            actions = [
+                action.detach() if self.gate and g != group else action
+                for g, (action, _) in enumerate(drawn)
+            ]
+            x = torch.cat([seen, *actions], -1)
+            pair = self.critics.nets[2 * group : 2 * group + 2]
+            values = [functional.softmax(net(x), -1) @ self.atoms for net in pair]
+            alpha, log_prob = self.log_alpha[group].detach().exp(), drawn[group][1]
+            cost = alpha * log_prob - torch.minimum(*values)
+            losses.append(self._mean(cost, batch, group))
+            entropies.append(-self._mean(log_prob.detach(), batch, group))
+        _step(self.actor_adam, torch.stack(losses).sum())
         self.critics.requires_grad_(True)
-        project(self.actors)
-        return loss.detach(), -torch.stack(log_probs).detach().mean(-1)
-
-    def _least_value(
-        self, critics: PlainCritics, group: int, seen: Tensor, joint: Tensor
-    ) -> Tensor:
-        values = []
-        for index in (2 * group, 2 * group + 1):
-            log_p = critics.member(index, seen, joint, training=False)
-            values.append((log_p.exp() * self.atoms).sum(-1))
-        return torch.minimum(*values)
+        for actor in self.actors:
+            actor.project_()
+        losses, entropies = torch.stack(losses).detach(), torch.stack(entropies)
+        return {"loss_actor": losses, "entropy": entropies}
 
     def _critic_step(self, batch: PlainBatch, noise: Tensor) -> Tensor:
         size = len(batch.observation)
-        both = torch.cat([batch.observation, batch.next_observation])
-        targets, joint = self._targets(batch, both, noise)
-        seen = self.critics.observe(both, batch.futures())
+        targets, joint = self._targets(batch, noise)
+        x = torch.cat([self.critics.train().see(*batch.both()), joint], -1)
         losses = []
-        for index in range(2 * self.num_groups):
-            log_p = self.critics.member(index, seen, joint, training=True)[:size]
-            losses.append(-(targets[index // 2] * log_p).sum(-1).mean())
-        loss = torch.stack(losses).mean()
-        self.critic_adam.zero_grad()
-        loss.backward()
-        self.critic_adam.step()
-        heads = [head for head in self.critics.heads if isinstance(head, nn.Linear)]
-        project(self.critics, heads)
-        return loss.detach()
+        for index, net in enumerate(self.critics.nets):
+            log_p = functional.log_softmax(net(x), -1)[:size]
+            cross = -(targets[index // 2] * log_p).sum(-1)
+            losses.append(self._mean(cross, batch, index // 2))
+        _step(self.critic_adam, torch.stack(losses).mean())
+        self.critics.project_()
+        return torch.stack(losses).detach().view(-1, 2).mean(1)
 
     @torch.no_grad()
-    def _targets(
-        self, batch: PlainBatch, both: Tensor, noise: Tensor
-    ) -> tuple[list[Tensor], Tensor]:
-        size = len(batch.observation)
+    def _targets(self, batch: PlainBatch, noise: Tensor) -> tuple[list[Tensor], Tensor]:
+        """One target distribution (B, Z) a group; joint actions at s and s', 2B rows.
+
+        The target critics run with batch statistics over both ends of the window.
+        """
         drawn = []
-        for actor, eps in zip(self.actors, noise, strict=True):
-            mean, std = actor(batch.next_observation, batch.next_future, training=False)
-            drawn.append(sample_action(mean, std, eps))
-        next_action = torch.cat([action for action, _ in drawn], -1)
-        joint = torch.cat([batch.action, next_action])
-        seen = self.target.observe(both, batch.futures())
-        targets = []
+        for actor, eps in zip(self.actors.eval(), noise, strict=True):
+            policy = self._policy(actor, batch.next_observation, batch.next_future)
+            drawn.append(sample_action(*policy, eps))
+        following = torch.cat([action for action, _ in drawn], -1)
+        joint = torch.cat([batch.action, following])
+        x = torch.cat([self.target.train().see(*batch.both()), joint], -1)
+        size, targets = len(batch.observation), []
         for group, (_, log_prob) in enumerate(drawn):
-            probs = [
-                self.target.member(i, seen, joint, training=True)[size:].exp()
-                for i in (2 * group, 2 * group + 1)
-            ]
-            values = torch.stack([(p * self.atoms).sum(-1) for p in probs])
-            second = (values.argmin(0) == 1)[:, None]
-            prob = torch.where(second, probs[1], probs[0])
+            pair = self.target.nets[2 * group : 2 * group + 2]
+            probs = [functional.softmax(net(x), -1)[size:] for net in pair]
+            first, second = (prob @ self.atoms for prob in probs)
+            least = torch.where((first <= second)[:, None], *probs)
             cost = self.log_alpha[group].exp() * log_prob
-            targets.append(self._backup(prob, batch, group, cost))
+            targets.append(self._backup(least, batch, group, cost))
         return targets, joint
 
     def _backup(
         self, prob: Tensor, batch: PlainBatch, group: int, cost: Tensor
     ) -> Tensor:
+        """``r + discount (z - cost)``, clipped, each mass split between two atoms."""
+        last, end = len(self.atoms) - 1, self.atoms[-1]
         carry = batch.discount * (1 - batch.terminated)
         moved = self.atoms - cost[:, None]
         moved = batch.reward[group][:, None] + carry[:, None] * moved
-        place = (moved.clamp(-V_MAX, V_MAX) + V_MAX) / (2 * V_MAX / (NUM_ATOMS - 1))
-        place = place.clamp(0, NUM_ATOMS - 1)
-        lower = place.floor().long()
-        upper = (lower + 1).clamp_max(NUM_ATOMS - 1)
-        share = place - lower
+        place = (moved.clamp(-end, end) + end) / (2 * end / last)
+        lower = place.floor().long().clamp(0, last - 1)
+        share = (place - lower).clamp(0, 1)
         target = torch.zeros_like(prob)
         target.scatter_add_(1, lower, prob * (1 - share))
-        return target.scatter_add_(1, upper, prob * share)
+        return target.scatter_add_(1, lower + 1, prob * share)
+
+
+def _step(adam: torch.optim.Adam, loss: Tensor) -> None:
+    adam.zero_grad()
+    loss.backward()
+    adam.step()

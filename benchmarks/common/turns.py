@@ -1,151 +1,182 @@
-"""Engines on a device: the environment's loop and the engine alone take turns.
+"""Environment and bare physics take turns in one process, from equal states.
 
-A turn begins with all worlds reset from the same draw. The environment's loop runs
-some control steps; then the engine repeats them from the same start with the same
-targets: no observation, no judge, no reset, no wrench. The device is waited for at the
-ends of a turn only.
+What else runs on the machine slows both alike. The ratio is what the environment costs:
+1 would be nothing but physics. A device is waited for at the ends of a turn only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from mujoco.batch import Batch
+from tensordict import TensorDictBase
+from torch.utils.benchmark import timer
+from torchrl.envs.utils import step_mdp
 
-from benchmarks.common.clock import now
 from flashdex import keys
+from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
 
-TURN = 32  # control steps, half a second of simulated time
-BURN_IN = 2  # turns that are not counted
+STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
-@dataclass(frozen=True)
-class Turn:
-    """Seconds that one turn took.
-
-    Attributes:
-        env: act with random actions, step, reset what has ended, s.
-        physics: the engine's steps alone, s.
-    """
+class Turn(NamedTuple):
+    """Seconds of one turn: the environment with its resets, and the physics alone."""
 
     env: float
     physics: float
 
 
-class TurnTaker:
-    """Runs turns on one environment.
+class Turns:
+    """Any engine: all worlds are reset, then the engine repeats the same targets.
 
-    Args:
-        env: environment on any engine.
-        steps: control steps of a turn.
-        seed: of the random actions.
+    The environment's loop runs some control steps, half a second of simulated time;
+    then the engine repeats them from the same draw: no observation, no judge, no reset,
+    no wrench.
     """
 
-    def __init__(self, env: TrackingEnv, *, steps: int = TURN, seed: int = 0) -> None:
+    burn_in = 2  # turns that are not counted
+
+    def __init__(self, env: TrackingEnv, *, steps: int = 32, seed: int = 0) -> None:
         self.env, self.steps = env, steps
         self.generator = torch.Generator(env.device).manual_seed(seed)
 
     def run(self) -> Turn:
         """One turn of each."""
         start = self.env.generator.get_state()
-        targets, env_seconds = self.loop()
+        targets, spent = self.loop()
         self.env.generator.set_state(start)  # the same draw: the same states
-        return Turn(env_seconds, self.replay(targets))
+        return Turn(spent, self.replay(targets))
 
     @torch.no_grad()
-    def loop(self) -> tuple[list[Tensor], float]:
-        """The environment's turn: its joint targets, (N, 2, J) each, and its seconds.
+    def loop(self) -> tuple[list[Any], float]:
+        """The environment's turn: what its physics was told each step, and seconds.
 
         The sum is what a random policy in the training loop would take.
         """
-        env = self.env
+        env, told = self.env, []
         shape = (env.num_envs, 2, env.bank.num_joints)
-        targets = []
-        td = env.reset()
-        begin = now(env.device)
+        td = self.start()
+        start = timer()
         for _ in range(self.steps):
             action = torch.rand(shape, generator=self.generator, device=env.device)
-            action = 2 * action - 1
-            for i, side in enumerate(keys.SIDES):
-                td.set(keys.action(side), action[:, i])
-            after = env.step(td).get("next")
-            targets.append(after[keys.JOINT_TARGET])
-            td = env.reset_worlds(after[keys.DONE].squeeze(-1))
-        return targets, now(env.device) - begin
+            env.put_action(td, 2 * action - 1)
+            td = env.step(td)
+            told.append(self.told(td.get("next")))
+            done = td["next", keys.DONE].squeeze(-1)
+            # as the training loop does
+            nothing_ends = env.is_host_device and not done.any()
+            td = step_mdp(td) if nothing_ends else env.reset_worlds(done)
+        self.td = td
+        return told, timer() - start
 
     @torch.no_grad()
-    def replay(self, targets: list[Tensor]) -> float:
-        """Seconds of the engine alone under the given targets, after a reset.
+    def replay(self, told: list[Any]) -> float:
+        """Seconds of the engine alone after a reset, under targets (N, 2, J) each."""
+        self.env.reset()
+        start = timer()
+        for target in told:
+            self.env.physics.step(target)
+        return timer() - start
 
-        Args:
-            targets: joint position targets, (N, 2, J) each.
-        """
-        env = self.env
-        env.reset()
-        begin = now(env.device)
-        for target in targets:
-            env.physics.step(target)
-        return now(env.device) - begin
+    def start(self) -> TensorDictBase:
+        """What the environment starts a turn from."""
+        return self.env.reset()
+
+    def told(self, after: TensorDictBase) -> Any:
+        """What the physics was told in a step, for `replay`."""
+        return after[keys.JOINT_TARGET]
 
 
-def measure(env: TrackingEnv, *, seconds: float, steps: int = TURN) -> dict[str, Any]:
-    """Let both take turns for some seconds.
+class BareTurns(Turns):
+    """The cpu engine: a bare ``mujoco.batch`` follows the environment turn by turn.
 
-    Args:
-        env: environment on any engine.
-        seconds: how long to measure, burn-in excluded.
-        steps: control steps of a turn.
+    Both step the very same models from the same states under the same controls, with
+    as many threads.
+    """
+
+    burn_in = 4
+
+    def __init__(self, env: TrackingEnv, *, num_threads: int, seed: int = 0) -> None:
+        super().__init__(env, steps=10, seed=seed)
+        assert isinstance(env.physics, CpuPhysics)
+        self.physics = env.physics
+        model = self.physics.scene(0).model
+        self.bare = Batch(model, nsim=env.num_envs, nthread=num_threads)
+        self.ctrl = self.bare.bind("ctrl")
+        # Derived fields that are bound are copied out; the environment binds these.
+        self.sensordata = self.bare.bind("sensordata")
+        self.td = env.reset()
+
+    def run(self) -> Turn:
+        """One turn of each, from equal states."""
+        envs = range(self.env.num_envs)
+        self.bare.set_models([self.physics.scene(e).model for e in envs])
+        for name in STATE:
+            self.bare.bind(name)[:] = self.physics.batch.bind(name)
+        controls, spent = self.loop()
+        return Turn(spent, self.replay(controls))
+
+    def start(self) -> TensorDictBase:
+        """Where the last turn ended."""
+        return self.td
+
+    def told(self, after: TensorDictBase) -> Any:
+        """Controls of all worlds, (N, nu)."""
+        return np.array(self.physics.batch.bind("ctrl"))
+
+    def replay(self, told: list[Any]) -> float:
+        """Seconds of the bare batch under the given controls."""
+        start = timer()
+        for ctrl in told:
+            self.ctrl[:] = ctrl
+            self.bare.step(nstep=self.physics.decimation)
+        return timer() - start
+
+
+def measure(turns: Turns, *, seconds: float) -> dict[str, Any]:
+    """Let both take turns for some seconds, burn-in excluded.
 
     Returns:
         ``env_steps_per_s``, ``physics_env_steps_per_s``, ``ratio`` (medians over
-        turns), ``warm_up_s`` of the first turns, number of ``segments``.
+        turns), number of ``segments``; off the cpu engine ``warm_up_s`` of the first
+        turns.
     """
-    taker = TurnTaker(env, steps=steps)
-    begin = now(env.device)
-    for _ in range(BURN_IN):
-        taker.run()
-    warm = now(env.device) - begin
-    turns: list[Turn] = []
-    end = now(env.device) + seconds
-    while now(env.device) < end or len(turns) < 3:
-        turns.append(taker.run())
-    worlds = steps * env.num_envs
-    return {
-        "env_steps_per_s": round(worlds / median(t.env for t in turns), 1),
-        "physics_env_steps_per_s": round(worlds / median(t.physics for t in turns), 1),
-        "ratio": round(median(t.physics / t.env for t in turns), 4),
-        "segments": len(turns),
-        "warm_up_s": round(warm, 2),
+    begin = timer()
+    for _ in range(turns.burn_in):
+        turns.run()
+    warm = timer() - begin
+    found: list[Turn] = []
+    end = timer() + seconds
+    while timer() < end or len(found) < 3:
+        found.append(turns.run())
+    steps = turns.steps * turns.env.num_envs
+    out: dict[str, Any] = {
+        "env_steps_per_s": round(steps / median(t.env for t in found), 1),
+        "physics_env_steps_per_s": round(steps / median(t.physics for t in found), 1),
+        "ratio": round(median(t.physics / t.env for t in found), 4),
+        "segments": len(found),
     }
+    return out if isinstance(turns, BareTurns) else {**out, "warm_up_s": round(warm, 2)}
 
 
-def physics_rate(env: TrackingEnv, *, seconds: float, steps: int = TURN) -> float:
-    """Env steps a second of the engine alone, under targets of random actions.
-
-    Args:
-        env: environment on any engine; its worlds are reset.
-        seconds: how long to measure.
-        steps: control steps of a turn.
-    """
-    taker = TurnTaker(env, steps=steps)
-    targets, _ = taker.loop()
-    taker.replay(targets[:2])  # records what the engine records on the first call
+def physics_rate(env: TrackingEnv, *, seconds: float, steps: int = 32) -> float:
+    """Env steps a second of the engine alone, under targets of random actions."""
+    turns = Turns(env, steps=steps)
+    targets, _ = turns.loop()
+    turns.replay(targets[:2])  # records what the engine records on the first call
     times = []
-    end = now(env.device) + seconds
-    while now(env.device) < end or len(times) < 2:
-        times.append(taker.replay(targets))
+    end = timer() + seconds
+    while timer() < end or len(times) < 2:
+        times.append(turns.replay(targets))
     return steps * env.num_envs / median(times)
 
 
 def room_used(env: TrackingEnv) -> dict[str, int]:
     """Contacts and constraint rows of the last substep, where the engine keeps them.
-
-    Args:
-        env: environment on any engine.
 
     Returns:
         ``nacon`` of all worlds and ``naconmax``, ``nefc`` of the fullest world and

@@ -14,35 +14,17 @@ from torch import Tensor
 
 
 def quat_normalize(q: Tensor) -> Tensor:
-    """Scale a quaternion to unit length.
-
-    Args:
-        q: wxyz, (..., 4), not zero.
-
-    Returns:
-        Unit quaternion, wxyz, (..., 4).
-    """
+    """Scale a quaternion, (..., 4) and not zero, to unit length."""
     return q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
 
 
 def quat_conj(q: Tensor) -> Tensor:
-    """Inverse of a unit quaternion: ``(w, -x, -y, -z)``.
-
-    Args:
-        q: wxyz, (..., 4).
-    """
+    """Inverse of a unit quaternion (..., 4): ``(w, -x, -y, -z)``."""
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
 def quat_mul(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product: rotate by ``b`` first, then by ``a``.
-
-    Args:
-        a: wxyz, (..., 4).
-        b: wxyz, (..., 4), leading axes broadcast with those of ``a``.
-
-    Returns:
-        wxyz, (..., 4).
+    """Hamilton product of (..., 4): rotate by ``b`` first, then by ``a``.
 
     Example:
         >>> i = torch.tensor([0.0, 1.0, 0.0, 0.0])
@@ -64,14 +46,9 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate vectors: ``v + 2 w (u x v) + 2 u x (u x v)`` with ``q = (w, u)``.
+    """Rotate vectors (..., 3) by unit quaternions (..., 4).
 
-    Args:
-        q: unit, wxyz, (..., 4).
-        v: vectors, (..., 3), leading axes broadcast with those of ``q``.
-
-    Returns:
-        Rotated vectors, (..., 3).
+    ``v + 2 w (u x v) + 2 u x (u x v)`` with ``q = (w, u)``.
     """
     u, v = torch.broadcast_tensors(q[..., 1:], v)
     t = 2 * torch.linalg.cross(u, v)
@@ -79,27 +56,12 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate vectors by the inverse of ``q``: world to body.
-
-    Args:
-        q: unit, wxyz, (..., 4).
-        v: vectors, (..., 3).
-
-    Returns:
-        Rotated vectors, (..., 3).
-    """
+    """Rotate vectors (..., 3) by the inverse of ``q`` (..., 4): world to body."""
     return quat_rotate(quat_conj(q), v)
 
 
 def quat_to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrix of a unit quaternion; column ``i`` is the turned axis ``i``.
-
-    Args:
-        q: unit, wxyz, (..., 4).
-
-    Returns:
-        Rotation matrix, (..., 3, 3).
-    """
+    """Matrix (..., 3, 3) of a unit quaternion; column ``i`` is the turned axis."""
     w, x, y, z = q.unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z),
@@ -116,15 +78,7 @@ def quat_to_matrix(q: Tensor) -> Tensor:
 
 
 def quat_from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
-    """Quaternion ``(cos(a/2), axis sin(a/2))``.
-
-    Args:
-        axis: unit axis, (..., 3).
-        angle: rad, (...), leading axes broadcast with those of ``axis``.
-
-    Returns:
-        Unit, wxyz, (..., 4).
-    """
+    """``(cos(a/2), axis sin(a/2))`` of a unit axis (..., 3) and an angle (...), rad."""
     half = 0.5 * angle[..., None]
     xyz = axis * torch.sin(half)
     w = torch.cos(half).expand(*xyz.shape[:-1], 1)
@@ -132,28 +86,14 @@ def quat_from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def quat_from_rotvec(v: Tensor) -> Tensor:
-    """Exponential map: axis times angle to quaternion; smooth at zero.
-
-    Args:
-        v: rotation vector, rad, (..., 3).
-
-    Returns:
-        Unit, wxyz, (..., 4).
-    """
+    """Exponential map: rotation vector (..., 3), rad, to (..., 4); smooth at zero."""
     half = 0.5 * torch.linalg.vector_norm(v, dim=-1, keepdim=True)
     # sin(h) / (2 h) through sinc, which is finite at zero with its gradient.
     return torch.cat((torch.cos(half), 0.5 * v * torch.sinc(half / math.pi)), dim=-1)
 
 
 def quat_to_rotvec(q: Tensor) -> Tensor:
-    """Logarithm: the shortest rotation vector, of length in [0, pi].
-
-    Args:
-        q: unit, wxyz, (..., 4).
-
-    Returns:
-        Rotation vector, rad, (..., 3).
-    """
+    """Logarithm: the shortest rotation vector (..., 3), of length in [0, pi], rad."""
     q = torch.where(q[..., :1] < 0, -q, q)
     w, xyz = q[..., :1], q[..., 1:]
     sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
@@ -172,10 +112,6 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
     The sine is taken from the vector part of ``conj(a) b``, which equals
     ``sqrt(1 - c^2)`` but keeps its digits when the angle is small.
 
-    Args:
-        a: unit, wxyz, (..., 4).
-        b: unit, wxyz, (..., 4).
-
     Returns:
         Angle in [0, pi], rad, (...).
     """
@@ -185,14 +121,5 @@ def quat_angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def transform_points(pos: Tensor, quat: Tensor, points: Tensor) -> Tensor:
-    """Body to world: ``R p + pos``.
-
-    Args:
-        pos: body origin, world, m, (..., 3).
-        quat: body orientation, unit, wxyz, (..., 4).
-        points: in the body frame, m, (..., P, 3).
-
-    Returns:
-        Points in the world, m, (..., P, 3).
-    """
+    """Body to world: ``R p + pos`` of points (..., P, 3), m."""
     return points @ quat_to_matrix(quat).mT + pos[..., None, :]

@@ -50,15 +50,11 @@ class SdfGrid(nn.Module):
             )
         self.resolution = shape[0]
         r = self.resolution
-        corner = torch.tensor(
-            [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        )
-        self.register_buffer("values", values.contiguous(), persistent=False)
-        self.register_buffer("origin", origin, persistent=False)
-        self.register_buffer("spacing", spacing, persistent=False)
-        self.register_buffer(
-            "_offset", corner @ torch.tensor([r * r, r, 1]), persistent=False
-        )
+        corner = torch.cartesian_prod(*[torch.arange(2)] * 3)
+        buffers = {"values": values.contiguous(), "origin": origin, "spacing": spacing}
+        buffers["_offset"] = corner @ torch.tensor([r * r, r, 1])
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer, persistent=False)
 
     def query(
         self, points: Tensor, index: Tensor | None = None
@@ -72,8 +68,8 @@ class SdfGrid(nn.Module):
                 away with a zero gradient. None: row 0 for all.
 
         Returns:
-            Signed distance, m, (...), and unit gradient in the object frame,
-            (..., 3). The gradient is zero where the interpolated field is flat.
+            Signed distance, m, (...), and unit gradient in the object frame, (..., 3),
+            zero where the interpolated field is flat.
         """
         if index is None:
             index = torch.zeros((), dtype=torch.int64, device=points.device)
@@ -95,11 +91,7 @@ class SdfGrid(nn.Module):
             empty[..., None], 0.0, slope / length.clamp_min(1e-9)
         )
 
-    def forward(
-        self, points: Tensor, index: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Same as :meth:`query`."""
-        return self.query(points, index)
+    forward = query
 
     def _interpolate(self, row: Tensor, node: Tensor) -> tuple[Tensor, Tensor]:
         """Value (...) and slope per node (..., 3) at node coordinates (..., 3)."""

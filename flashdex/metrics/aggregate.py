@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -12,11 +13,6 @@ from flashdex.metrics.errors import Signals
 @dataclass(frozen=True)
 class Rate:
     """Passed over passed and failed; what was not measured is shown, never counted.
-
-    Args:
-        passed: number of passes.
-        failed: number of failures.
-        not_measured: number without an answer.
 
     Example:
         >>> str(Rate(43, 7, 0))
@@ -29,15 +25,9 @@ class Rate:
 
     @classmethod
     def of(cls, states: Iterable[State]) -> Rate:
-        """Count states.
-
-        Args:
-            states: one a motion.
-        """
-        listed = list(states)
-        return cls(
-            listed.count("passed"), listed.count("failed"), listed.count("not_measured")
-        )
+        """Count states, one a motion."""
+        counts = Counter(states)
+        return cls(counts["passed"], counts["failed"], counts["not_measured"])
 
     @property
     def measured(self) -> int:
@@ -54,11 +44,7 @@ class Rate:
 
 
 def rates(scores: Iterable[Mapping[str, Verdict]]) -> dict[str, Rate]:
-    """Rate of every criterion over a collection.
-
-    Args:
-        scores: result of ``score`` for each motion.
-    """
+    """Rate of every criterion over a collection, of the ``score`` of each motion."""
     listed = list(scores)
     names = dict.fromkeys(name for one in listed for name in one)
     return {
@@ -69,35 +55,25 @@ def rates(scores: Iterable[Mapping[str, Verdict]]) -> dict[str, Rate]:
 
 @dataclass(frozen=True)
 class MeanErrors:
-    """Mean object errors of one motion, over frames and hands' objects.
+    """Mean object errors of one motion, over frames and hands' objects."""
 
-    Args:
-        pos: m.
-        rot: rad.
-    """
-
-    pos: float
-    rot: float
+    pos: float  # m
+    rot: float  # rad
 
 
 def mean_object_errors(signals: Signals, *, grace: int = 0) -> MeanErrors | None:
     """Mean object errors of one rollout; None if they cannot be measured.
 
-    A shared object counts once per hand, as everywhere.
-
-    Args:
-        signals: errors and masks of the rollout.
-        grace: first steps left out.
+    A shared object counts once per hand, as everywhere; the first ``grace`` steps are
+    left out.
     """
     pos, rot = signals.object_pos_error, signals.object_rot_error
     if pos is None or rot is None or not signals.slots or not signals.is_finite:
         return None
     if signals.num_frames <= grace:
         return None
-    columns = signals.slots
-    return MeanErrors(
-        float(pos[grace:, columns].mean()), float(rot[grace:, columns].mean())
-    )
+    pos, rot = (error[grace:, signals.slots].mean() for error in (pos, rot))
+    return MeanErrors(float(pos), float(rot))
 
 
 def mope_more(

@@ -17,15 +17,9 @@ MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
 
 
 def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Tensor:
-    """Draw stored mesh vertices uniformly, with replacement only if there are too few.
+    """Draw stored vertices (V, 3) uniformly, with replacement if there are too few.
 
-    Args:
-        vertices: object frame, m, (V, 3).
-        count: how many; DexMachina 500.
-        seed: DexMachina 42, FlashCHORD 0.
-
-    Returns:
-        (count, 3).
+    DexMachina draws 500 with seed 42, FlashCHORD uses seed 0.
     """
     rng = np.random.default_rng(seed)
     rows = rng.choice(len(vertices), size=count, replace=len(vertices) < count)
@@ -35,31 +29,20 @@ def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Te
 def add_distance(
     vertices: Tensor, pos: Tensor, quat: Tensor, ref_pos: Tensor, ref_quat: Tensor
 ) -> Tensor:
-    """ADD: ``mean_v |R v + p - (R_ref v + p_ref)|``.
+    """ADD: ``mean_v |R v + p - (R_ref v + p_ref)|``, m, (...).
 
-    Args:
-        vertices: object frame, m, (V, 3).
-        pos: world, m, (..., 3).
-        quat: wxyz, (..., 4).
-        ref_pos: world, m, (..., 3).
-        ref_quat: wxyz, (..., 4).
-
-    Returns:
-        m, (...).
+    Vertices (V, 3) are in the object frame, positions (..., 3) in the world, m;
+    quaternions are wxyz, (..., 4).
     """
     simulated = transform_points(pos, quat, vertices)
-    return position_error(
-        simulated, transform_points(ref_pos, ref_quat, vertices)
-    ).mean(-1)
+    reference = transform_points(ref_pos, ref_quat, vertices)
+    return position_error(simulated, reference).mean(-1)
 
 
 def add_auc(add: Tensor) -> float:
     """Area under accuracy(tau) = share of frames with ADD < tau, tau = 1 ... 9 cm.
 
-    Trapezoids, the nine thresholds spread over [0, 1].
-
-    Args:
-        add: m, any shape; pooled over all of it.
+    Trapezoids, the nine thresholds spread over [0, 1]; ADD in m, pooled over any shape.
     """
     flat = add.double().flatten()
     accuracy = torch.stack([(flat < tau).double().mean() for tau in AUC_THRESHOLDS])
@@ -67,25 +50,14 @@ def add_auc(add: Tensor) -> float:
 
 
 def add_auc_dexmachina(parts: Sequence[Tensor]) -> float:
-    """Mean over parts of :func:`add_auc`.
-
-    Args:
-        parts: ADD of each part over the frames, m, (T,).
-    """
+    """Mean over parts of `add_auc`, of the ADD of each part, m, (T,)."""
     return sum(add_auc(part) for part in parts) / len(parts)
 
 
 def mppe(pos: Tensor, quat: Tensor, ref_pos: Tensor, ref_quat: Tensor) -> Tensor:
     """Mean error of six body-fixed points at +-5 cm on the axes, max over bodies.
 
-    Args:
-        pos: world, m, (T, O, 3).
-        quat: wxyz, (T, O, 4).
-        ref_pos: world, m, (T, O, 3).
-        ref_quat: wxyz, (T, O, 4).
-
-    Returns:
-        m, mean over frames, ().
+    Positions are world, m, (T, O, 3), quaternions (T, O, 4); mean over frames, m, ().
     """
     axes = torch.eye(3, dtype=pos.dtype, device=pos.device) * PROBE
     points = torch.cat((axes, -axes))
@@ -93,23 +65,14 @@ def mppe(pos: Tensor, quat: Tensor, ref_pos: Tensor, ref_quat: Tensor) -> Tensor
 
 
 def object_path_length(pos: Tensor) -> Tensor:
-    """``sum_t |p_t+1 - p_t|``.
-
-    Args:
-        pos: world, m, (T, ..., 3).
-
-    Returns:
-        m, (...).
-    """
+    """``sum_t |p_t+1 - p_t|`` of positions (T, ..., 3), m."""
     return position_error(pos[1:], pos[:-1]).sum(0)
 
 
 def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
     """``max_t (z - z_0)`` simulated over reference; None if the reference rises < 2 cm.
 
-    Args:
-        pos: world, m, (T, 3).
-        ref_pos: world, m, (T, 3).
+    Positions are world, m, (T, 3).
     """
     rise = (pos[:, 2] - pos[0, 2]).max()
     ref_rise = (ref_pos[:, 2] - ref_pos[0, 2]).max()
@@ -117,10 +80,5 @@ def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
 
 
 def smoothness(qvel: Tensor, *, fps: float) -> float:
-    """Mean squared joint acceleration, from differences of stored velocities.
-
-    Args:
-        qvel: joint velocities, rad/s or m/s, (T, n).
-        fps: control rate, Hz.
-    """
+    """Mean squared joint acceleration, from differences of stored velocities (T, n)."""
     return float(((qvel[1:] - qvel[:-1]) * fps).square().mean())

@@ -6,7 +6,7 @@ before what failed, so that all methods that share a motion share one denominato
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from flashdex.metrics.criteria_table import (
     Blame,
     Criterion,
     Limits,
+    State,
     Term,
     Verdict,
     criterion_names,
@@ -57,8 +58,16 @@ def _reduce_time(series: Tensor, how: str) -> float:
     return float(series.mean())
 
 
-def _is_beyond(value: float, term: Term) -> bool:
+def _is_beyond(value: Any, term: Term) -> Any:
+    """A number or each of a series against the limit."""
     return value >= term.limit if term.strict else value > term.limit
+
+
+def _blame(term: Term, side: Side, series: Tensor, grace: int) -> Blame:
+    rows = _is_beyond(series, term).nonzero()
+    frame = int(rows[0]) + grace if len(rows) else -1
+    value = _reduce_time(series, term.time)
+    return Blame(side, term.quantity, value, term.limit, frame)
 
 
 def _object_sides(
@@ -70,14 +79,6 @@ def _object_sides(
         drift = reference_drift(signals.ref_object_pos)
         chosen = [h for h in chosen if float(drift[signals.slot(h)]) >= STATIC_DRIFT]
     return chosen
-
-
-def _blame(term: Term, side: Side, series: Tensor, grace: int) -> Blame:
-    beyond = (series >= term.limit) if term.strict else (series > term.limit)
-    rows = beyond.nonzero()
-    frame = int(rows[0]) + grace if len(rows) else -1
-    value = _reduce_time(series, term.time)
-    return Blame(side, term.quantity, value, term.limit, frame)
 
 
 def _unmeasurable(
@@ -109,17 +110,17 @@ def _judge(
     objects = _object_sides(signals, criterion, sides)
     for term in criterion.terms:
         used = objects if term.quantity.startswith("object") else hands
-        series = {h: _series(signals, term, h, criterion.grace) for h in used}
-        own = {h: _reduce_time(s, term.time) for h, s in series.items()}  # type: ignore[arg-type]
+        series = {
+            h: cast(Tensor, _series(signals, term, h, criterion.grace)) for h in used
+        }
+        own = {h: _reduce_time(s, term.time) for h, s in series.items()}
         mean = sum(own.values()) / len(own)
         value = max(own.values()) if term.hands == "worst" else mean
         values[term.quantity] = value
         if _is_beyond(value, term):
             guilty = [h for h in used if _is_beyond(own[h], term)] or used
-            blames += [
-                _blame(term, SIDES[h], series[h], criterion.grace)  # type: ignore[arg-type]
-                for h in guilty
-            ]
+            grace = criterion.grace
+            blames += [_blame(term, SIDES[h], series[h], grace) for h in guilty]
     return values, sorted(blames, key=lambda b: b.side)
 
 
@@ -131,20 +132,22 @@ def _score_one(
     completed: bool | None,
     partial: bool,
 ) -> Verdict:
+    def short(state: State, reason: str = "") -> Verdict:
+        return Verdict(name, state, reason, fps=signals.fps)
+
     reason = _unmeasurable(signals, criterion, sides, completed)
     if reason:
-        return Verdict(name, "not_measured", reason, fps=signals.fps)
+        return short("not_measured", reason)
     if not signals.is_finite:
-        return Verdict(name, "failed", "numerics", fps=signals.fps)
+        return short("failed", "numerics")
     if criterion.family == "completed":
-        state = "passed" if completed else "failed"
-        return Verdict(name, state, "" if completed else "terminated", fps=signals.fps)
+        return short("passed") if completed else short("failed", "terminated")
     is_short = signals.num_frames < signals.num_ref_frames - 1
     if is_short and not (partial and criterion.family == "spider"):
-        return Verdict(name, "failed", "incomplete", fps=signals.fps)
+        return short("failed", "incomplete")
     num_scored = signals.num_frames - criterion.grace
     if num_scored <= 0:
-        return Verdict(name, "not_measured", "no_scored_frames", fps=signals.fps)
+        return short("not_measured", "no_scored_frames")
     values, blames = _judge(signals, criterion, sides)
     return Verdict(
         name,
@@ -180,7 +183,7 @@ def score(
     Returns:
         name -> verdict, in the order of :func:`criterion_names`.
     """
-    variants: Mapping[str, list[int]] = {"": [0, 1], "_left": [0], "_right": [1]}
+    variants = {"": [0, 1], "_left": [0], "_right": [1]}
     return {
         c.name + suffix: _score_one(
             signals, c, c.name + suffix, sides, completed, partial

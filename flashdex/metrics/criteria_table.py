@@ -95,25 +95,21 @@ def _maniptrans(limits: Limits, grace: int) -> Iterable[Criterion]:
     yield Criterion("sr_mt_obj_flashchord", terms, "mt", 0)
 
 
-def _spider_terms(
-    limits: Limits, pos: Quantity, *, hands: HandReduction, strict: bool
-) -> tuple[Term, ...]:
-    return (
-        Term(pos, limits.spider_pos, hands=hands, strict=strict),
-        Term("object_rot", limits.spider_rot, hands=hands, strict=strict),
-    )
-
-
 def _spider(limits: Limits) -> Iterable[Criterion]:
-    centred = _spider_terms(limits, "object_pos_centred", hands="mean", strict=False)
-    raw = _spider_terms(limits, "object_pos", hands="mean", strict=True)
-    worst = _spider_terms(limits, "object_pos", hands="worst", strict=True)
-    pooled = _spider_terms(limits, "object_pos", hands="mean", strict=False)
-    yield Criterion("sr_spider_centred", centred, "spider", 0, drop_static=True)
-    yield Criterion("sr_spider_raw", raw, "spider", 0, drop_static=True)
-    yield Criterion("sr_spider_worst", worst, "spider", 0, drop_static=True)
-    # FlashCHORD's evaluator: raw, <=, static objects counted
-    yield Criterion("sr_spider_flashchord", pooled, "spider", 0)
+    rules: tuple[tuple[str, Quantity, HandReduction, bool], ...] = (
+        ("centred", "object_pos_centred", "mean", False),
+        ("raw", "object_pos", "mean", True),
+        ("worst", "object_pos", "worst", True),
+        # FlashCHORD's evaluator: raw, <=, static objects counted
+        ("flashchord", "object_pos", "mean", False),
+    )
+    for name, pos, hands, strict in rules:
+        terms = (
+            Term(pos, limits.spider_pos, hands=hands, strict=strict),
+            Term("object_rot", limits.spider_rot, hands=hands, strict=strict),
+        )
+        drop = name != "flashchord"
+        yield Criterion(f"sr_spider_{name}", terms, "spider", 0, drop_static=drop)
 
 
 def make_criteria(*, limits: Limits | None = None, grace: int = 15) -> list[Criterion]:
@@ -144,11 +140,7 @@ def criterion_names() -> list[str]:
 
 
 def resolve_criterion(name: str) -> str:
-    """The full name of a criterion; ``sr_spider`` is FDR's name for the centred form.
-
-    Args:
-        name: a name from :func:`criterion_names` or an alias.
-    """
+    """The full name; ``sr_spider`` is FDR's name for the centred form."""
     full = ALIASES.get(name, name)
     if full not in criterion_names():
         raise UnknownNameError(name, [*criterion_names(), *ALIASES], where="criterion")
@@ -161,50 +153,33 @@ CertificateVerdict = Literal["certified", "robust", "failed", "not_measured"]
 
 @dataclass(frozen=True)
 class Blame:
-    """One limit that one hand crossed.
-
-    Args:
-        side: the hand, or the hand of that object.
-        term: signal that was too large, e.g. ``object_pos``.
-        value: this hand's own value, m or rad.
-        limit: m or rad.
-        frame: first scored row at which the signal itself is beyond the limit, or -1.
-    """
+    """One limit that one hand, or the object of one hand, crossed."""
 
     side: Side
-    term: str
-    value: float
-    limit: float
-    frame: int
+    term: str  # signal that was too large, e.g. ``object_pos``
+    value: float  # this hand's own, m or rad
+    limit: float  # m or rad
+    frame: int  # first scored row at which the signal is beyond the limit, or -1
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Result of one criterion on one rollout.
 
-    Args:
-        name: criterion with its variant, e.g. ``sr_mt_obj_x2_left``.
-        state: passed, failed or not_measured.
-        reason: empty when passed; ``limit``, ``incomplete``, ``numerics``,
-            ``terminated`` when failed; ``static_reference``, ``no_object``,
-            ``hand_absent``, ``no_scored_frames``, ``missing:<key>`` when not measured.
-        values: term -> value that was compared, m or rad.
-        limits: term -> limit, m or rad.
-        blame: every limit crossed, hands [left, right].
-        grace: first steps that were not scored.
-        num_scored: frames that were.
-        fps: control rate, Hz.
+    The reason is empty when passed; ``limit``, ``incomplete``, ``numerics``,
+    ``terminated`` when failed; ``static_reference``, ``no_object``, ``hand_absent``,
+    ``no_scored_frames``, ``missing:<key>`` when not measured.
     """
 
-    name: str
+    name: str  # criterion with its variant, e.g. ``sr_mt_obj_x2_left``
     state: State
     reason: str = ""
-    values: Mapping[str, float] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    blame: tuple[Blame, ...] = ()
-    grace: int = 0
-    num_scored: int = 0
-    fps: float = 0.0
+    values: Mapping[str, float] = field(default_factory=dict)  # of each term, m or rad
+    limits: Mapping[str, float] = field(default_factory=dict)  # of each term, m or rad
+    blame: tuple[Blame, ...] = ()  # every limit crossed, hands [left, right]
+    grace: int = 0  # first steps that were not scored
+    num_scored: int = 0  # frames that were
+    fps: float = 0.0  # control rate, Hz
 
     @property
     def is_passed(self) -> bool:

@@ -20,15 +20,7 @@ Array = Tensor | np.ndarray
 
 
 def position_error(pos: Tensor, ref_pos: Tensor) -> Tensor:
-    """Distance of origins, ``|p - p_ref|``.
-
-    Args:
-        pos: world, m, (..., 3).
-        ref_pos: world, m, (..., 3).
-
-    Returns:
-        m, (...).
-    """
+    """Distance of origins in the world, ``|p - p_ref|``, m: (..., 3) to (...)."""
     return torch.linalg.vector_norm(pos - ref_pos, dim=-1)
 
 
@@ -37,9 +29,6 @@ def centred_position_error(offset: Tensor) -> Tensor:
 
     Args:
         offset: ``p - p_ref`` over the scored window, world, m, (T, ..., 3).
-
-    Returns:
-        m, (T, ...).
     """
     return torch.linalg.vector_norm(offset - offset.mean(0, keepdim=True), dim=-1)
 
@@ -51,9 +40,6 @@ def joint_position_error(joints: Tensor, ref_joints: Tensor) -> Tensor:
         joints: robot link origins, level-1 links in the first half of M and distal
             links in the second, world, m, (..., M, 3) with M even.
         ref_joints: human joints in the same order, world, m, (..., M, 3).
-
-    Returns:
-        m, (...).
     """
     distance = position_error(joints, ref_joints)
     if distance.shape[-1] % 2:
@@ -63,14 +49,7 @@ def joint_position_error(joints: Tensor, ref_joints: Tensor) -> Tensor:
 
 
 def reference_drift(ref_pos: Tensor) -> Tensor:
-    """``mean_t |p_ref,t - p_ref,0|``: below 1 mm a reference counts as static.
-
-    Args:
-        ref_pos: world, m, (T, ..., 3).
-
-    Returns:
-        m, (...).
-    """
+    """``mean_t |p_ref,t - p_ref,0|`` of (T, ..., 3), m: below 1 mm it is static."""
     return position_error(ref_pos, ref_pos[:1]).mean(0)
 
 
@@ -79,13 +58,8 @@ def align_to_reference(
 ) -> Tensor:
     """Rows of a rollout that belong to the reference rows: nearest earlier sample.
 
-    Args:
-        num_frames: rows of the rollout.
-        num_ref: rows of the reference.
-        fps: rate of the rollout, Hz.
-        ref_fps: rate of the reference, Hz.
-        first_step: time of row 0 in steps of its own rate: 1 for states after a step,
-            0 for tables that start with the initial state.
+    Rates are in Hz. ``first_step`` is the time of row 0 in steps of its own rate: 1 for
+    states after a step, 0 for tables that start with the initial state.
 
     Returns:
         Row indices, (K,), K <= num_ref: reference rows the rollout has reached.
@@ -100,35 +74,22 @@ def align_to_reference(
 class Signals:
     """Errors of one rollout and the masks that say which of them count.
 
-    Args:
-        object_pos_offset: ``p - p_ref`` of the object frames, world, m, (T, O, 3).
-        object_rot_error: geodesic angle, rad, (T, O).
-        ref_object_pos: the whole reference, world, m, (T_ref, O, 3).
-        fingertip_error: robot tip to human tip, m, (T, 2, 5), or None.
-        joint_error: see :func:`joint_position_error`, m, (T, 2), or None.
-        wrist_pos_error: m, (T, 2), or None.
-        hand_active: hands [left, right] that take part.
-        hand_object: object slot of each hand, -1 without object.
-        num_frames: T, rows of the rollout.
-        num_ref_frames: T_ref, rows of the whole reference.
-        fps: control rate, Hz.
-        missing: absent signal -> key that was missing.
-        overflow: the engine dropped contacts or constraints.
+    Frames are the T rows of the rollout; sides and `hand_active` are [left, right].
     """
 
-    object_pos_offset: Tensor | None
-    object_rot_error: Tensor | None
-    ref_object_pos: Tensor | None
-    fingertip_error: Tensor | None
-    joint_error: Tensor | None
-    wrist_pos_error: Tensor | None
-    hand_active: tuple[bool, bool]
-    hand_object: tuple[int, int]
-    num_frames: int
-    num_ref_frames: int
-    fps: float
-    missing: Mapping[str, str] = field(default_factory=dict)
-    overflow: bool = False
+    object_pos_offset: Tensor | None  # p - p_ref in the world, m, (T, O, 3)
+    object_rot_error: Tensor | None  # geodesic angle, rad, (T, O)
+    ref_object_pos: Tensor | None  # the whole reference, world, m, (T_ref, O, 3)
+    fingertip_error: Tensor | None  # robot tip to human tip, m, (T, 2, 5)
+    joint_error: Tensor | None  # see `joint_position_error`, m, (T, 2)
+    wrist_pos_error: Tensor | None  # m, (T, 2)
+    hand_active: tuple[bool, bool]  # hands that take part
+    hand_object: tuple[int, int]  # object slot of each hand, -1 without object
+    num_frames: int  # T
+    num_ref_frames: int  # T_ref, of the whole reference
+    fps: float  # control rate, Hz
+    missing: Mapping[str, str] = field(default_factory=dict)  # signal -> absent key
+    overflow: bool = False  # the engine dropped contacts or constraints
 
     @property
     def object_pos_error(self) -> Tensor | None:
@@ -150,18 +111,16 @@ class Signals:
     def is_finite(self) -> bool:
         """No NaN or infinity in anything that counts, and no engine overflow."""
         hands = [h for h in range(2) if self.hand_active[h]]
-        parts = [
-            x[:, rows]
-            for x, rows in (
-                (self.object_pos_offset, self.slots),
-                (self.object_rot_error, self.slots),
-                (self.fingertip_error, hands),
-                (self.joint_error, hands),
-                (self.wrist_pos_error, hands),
-            )
-            if x is not None
-        ]
-        return not self.overflow and all(bool(torch.isfinite(p).all()) for p in parts)
+        parts = (
+            (self.object_pos_offset, self.slots),
+            (self.object_rot_error, self.slots),
+            (self.fingertip_error, hands),
+            (self.joint_error, hands),
+            (self.wrist_pos_error, hands),
+        )
+        return not self.overflow and all(
+            bool(x[:, rows].isfinite().all()) for x, rows in parts if x is not None
+        )
 
 
 def _pair(
@@ -180,14 +139,6 @@ def _pair(
         return f"ref_{key}"
     length = min(len(sim), len(ref))
     return sim[:length], ref[:length]
-
-
-def _error(
-    found: Mapping[str, tuple[Tensor, Tensor]],
-    key: str,
-    distance: Callable[[Tensor, Tensor], Tensor],
-) -> Tensor | None:
-    return distance(*found[key]) if key in found else None
 
 
 def compute_signals(
@@ -239,13 +190,16 @@ def compute_signals(
     num_frames = lengths.pop()
     default_ref = num_frames if total is None else len(total)
 
+    def error(key: str, distance: Callable[..., Tensor]) -> Tensor | None:
+        return distance(*found[key]) if key in found else None
+
     return Signals(
         object_pos_offset=None if pos is None else pos[0] - pos[1],
-        object_rot_error=_error(found, "object_quat", quat_angle),
+        object_rot_error=error("object_quat", quat_angle),
         ref_object_pos=None if pos is None else torch.as_tensor(total).double(),
-        fingertip_error=_error(found, "fingertips", position_error),
-        joint_error=_error(found, "joints", joint_position_error),
-        wrist_pos_error=_error(found, "wrist_pos", position_error),
+        fingertip_error=error("fingertips", position_error),
+        joint_error=error("joints", joint_position_error),
+        wrist_pos_error=error("wrist_pos", position_error),
         hand_active=active,
         hand_object=slots,
         num_frames=num_frames,
@@ -266,14 +220,8 @@ def frozen_object(
 ) -> Signals:
     """Signals of objects that stay at their first reference pose: pure arithmetic.
 
-    Criteria with hand terms are not measured on it: there is no hand.
-
-    Args:
-        ref_pos: world, m, (T, O, 3).
-        ref_quat: wxyz, (T, O, 4).
-        hand_active: hands [left, right] that take part.
-        hand_object: object slot of each hand, -1 without object.
-        fps: control rate, Hz.
+    Criteria with hand terms are not measured on it: there is no hand. Positions are
+    world, m, (T, O, 3), quaternions wxyz, (T, O, 4); the rest as in `compute_signals`.
     """
     data = {
         "object_pos": ref_pos[:1].expand_as(ref_pos),

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from flashdex.modules.future import FutureEncoder
-from flashdex.modules.layers import Mode, UnitLinear
-from flashdex.modules.product import product
+from flashdex.modules.layers import Mode, PlainLinear, UnitLinear, held
 from flashdex.modules.trunk import FlashTrunk
 
 Head = Literal["centred", "unit"]
@@ -69,10 +68,9 @@ class FlashActor(nn.Module):
         self.trunk = FlashTrunk(
             observation_dim + latent, width, num_blocks=num_blocks, ensemble=num_groups
         )
-        if head == "unit":
-            self.head = UnitLinear(width, 2 * action_dim, ensemble=num_groups)
-        else:
-            self.head = PlainLinear(width, 2 * action_dim, ensemble=num_groups)
+        make = UnitLinear if head == "unit" else PlainLinear
+        self.head = make(width, 2 * action_dim, ensemble=num_groups)
+        if head == "centred":
             nn.init.normal_(self.head.weight[:, :action_dim], std=CENTRED_MEAN_STD)
         self.head_bias = nn.Parameter(torch.zeros(num_groups, 2 * action_dim))
         if init_std is not None:
@@ -97,44 +95,16 @@ class FlashActor(nn.Module):
         mode: Mode,
         keep: slice | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Mean and std of the Gaussian before the tanh.
+        """Mean and std (G, B, A) of the Gaussian before the tanh.
 
-        Args:
-            observation: (B, D).
-            future: window of coming frames, (B, C, K), if the actor has an encoder.
-            mode: see `flashdex.modules.layers.Mode`.
-            keep: rows to return; every row enters the batch statistics.
-
-        Returns:
-            mean and std, (G, B, A) each.
+        The observation is (B, D), the window of coming frames (B, C, K). Only the rows
+        ``keep`` are returned; every row enters the batch statistics.
         """
         parts = [observation]
         if self.future_encoder is not None:
             parts.append(self.future_encoder(future, mode=mode))
         x = self.trunk(parts, mode=mode, keep=keep)
-        bias = self.head_bias.detach() if mode == "frozen" else self.head_bias
-        out = self.head(x, mode=mode) + bias[:, None]
+        out = self.head(x, mode=mode) + held(self.head_bias, mode)[:, None]
         mean, raw = out.split(self.action_dim, dim=-1)
         low, high = self.log_std_range
         return mean, torch.exp(low + 0.5 * (high - low) * (1.0 + torch.tanh(raw)))
-
-
-class PlainLinear(nn.Module):
-    """A linear map without bias and without projection; weights start at zero.
-
-    Args:
-        in_features: size of the input.
-        out_features: size of the output.
-        ensemble: number of members E.
-    """
-
-    def __init__(
-        self, in_features: int, out_features: int, *, ensemble: int = 1
-    ) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(ensemble, out_features, in_features))
-
-    def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
-        """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
-        weight = self.weight.detach() if mode == "frozen" else self.weight
-        return product(x, weight)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from flashdex.modules.future import FutureEncoder
-from flashdex.modules.layers import Mode, UnitLinear
+from flashdex.modules.layers import Mode, UnitLinear, held
 from flashdex.modules.trunk import FlashTrunk
 
 CriticAction = Literal["joint", "own"]
@@ -88,17 +88,11 @@ class EnsembleCritic(nn.Module):
         mode: Mode,
         keep: slice | None = None,
     ) -> Tensor:
-        """Log-probabilities of the atoms.
+        """Log-probabilities of the atoms, (G, M, B, Z).
 
-        Args:
-            observation: (B, D).
-            action: joint action (B, G A), or one view of it per group, (G, B, G A).
-            future: window of coming frames, (B, C, K), if the critic has an encoder.
-            mode: see `flashdex.modules.layers.Mode`.
-            keep: rows to return; every row enters the batch statistics.
-
-        Returns:
-            (G, M, B, Z).
+        The observation is (B, D), the window (B, C, K), the joint action (B, G A) or
+        one view of it per group, (G, B, G A). Only the rows ``keep`` are returned;
+        every row enters the batch statistics.
         """
         parts = [observation]
         if self.future_encoder is not None:
@@ -106,8 +100,7 @@ class EnsembleCritic(nn.Module):
         if action.dim() == 3:
             action = action.repeat_interleave(self.num_members, 0)
         x = self.trunk([*parts, action], mode=mode, keep=keep)
-        bias = self.head_bias.detach() if mode == "frozen" else self.head_bias
-        logits = self.head(x, mode=mode) + bias[:, None]
+        logits = self.head(x, mode=mode) + held(self.head_bias, mode)[:, None]
         log_prob = torch.log_softmax(logits, dim=-1)
         return log_prob.unflatten(0, (self.num_groups, self.num_members))
 

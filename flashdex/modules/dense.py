@@ -83,13 +83,8 @@ def linear_norm_relu(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``relu(gamma (z - mean) / sqrt(var + eps) + beta)``, ``z = x W^T``, over rows.
 
-    Args:
-        x: input, (E, B, K).
-        weight: linear map without bias, (E, d, K).
-        gamma: scale, (E, d).
-        beta: offset, (E, d).
-        eps: added to the variance.
-        keep: rows to return; all rows enter the statistics.
+    ``x`` is (E, B, K), the weight (E, d, K), gamma and beta (E, d). Only the rows
+    ``keep`` are returned; all of them enter the statistics.
 
     Returns:
         Output (E, rows, d), mean (E, d) and biased variance (E, d) of ``z``.

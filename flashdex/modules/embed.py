@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from flashdex.modules.layers import Mode, UnitBatchNorm, UnitLinear
+from flashdex.modules.layers import Mode, UnitBatchNorm, UnitLinear, held
 from flashdex.modules.product import product
 
 
@@ -48,21 +48,16 @@ class InputEmbed(nn.Module):
             self.linear.project_()
 
     def forward(self, parts: Sequence[Tensor], *, mode: Mode) -> Tensor:
-        """Embed the concatenation of ``parts``.
+        """Embed the concatenation of ``parts`` to (E, B, width).
 
-        Args:
-            parts: tensors (B, d) seen by all members or (E, B, d), one view a member;
-                in the order of the input columns.
-            mode: see `flashdex.modules.layers.Mode`.
-
-        Returns:
-            (E, B, width).
+        A part is (B, d), seen by all members, or (E, B, d), one view a member; in the
+        order of the input columns.
         """
         if mode == "train":
             centred, scale, shift = self._batch_normalise(parts)
         else:
             centred, scale, shift = self._running_normalise(parts, mode)
-        weight = self.linear.parameter(mode)
+        weight = held(self.linear.weight, mode)
         if self.column_mask is not None:
             scale, shift = scale * self.column_mask, shift * self.column_mask
         bias = product(shift.unsqueeze(1), weight).squeeze(1)
@@ -74,18 +69,18 @@ class InputEmbed(nn.Module):
     def _batch_normalise(
         self, parts: Sequence[Tensor]
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        gamma, beta = self.norm.affine("train")
         means = [p.mean(-2, keepdim=True) for p in parts]
         centred = [p - m for p, m in zip(parts, means, strict=True)]
         variances = [c.square().mean(-2, keepdim=True) for c in centred]
         mean, var = _concatenate(means), _concatenate(variances)
         self.norm.track_(mean, var, parts[0].shape[-2])
-        return centred, gamma * torch.rsqrt(var + self.norm.eps), beta
+        scale = self.norm.weight * torch.rsqrt(var + self.norm.eps)
+        return centred, scale, self.norm.bias
 
     def _running_normalise(
         self, parts: Sequence[Tensor], mode: Mode
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        gamma, beta = self.norm.affine(mode)
+        gamma, beta = held(self.norm.weight, mode), held(self.norm.bias, mode)
         scale = gamma * torch.rsqrt(self.norm.running_var + self.norm.eps)
         # Any common centre is exact; member 0's mean keeps the products small, so that
         # a feature with a large offset does not lose digits in float32.

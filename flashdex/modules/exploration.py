@@ -58,13 +58,9 @@ class NoiseRepetition(nn.Module):
 
     @torch.no_grad()
     def forward(self, shape: tuple[int, int, int]) -> Tensor:
-        """Noise of the next step.
+        """Standard normal noise of the next step.
 
-        Args:
-            shape: groups, environments, actions (G, N, A). A change redraws everything.
-
-        Returns:
-            (G, N, A), standard normal.
+        The shape is groups, environments, actions (G, N, A); a change redraws all.
         """
         fits = tuple(self.noise.shape) == tuple(shape)
         # a loaded state may come from the other clock
@@ -72,12 +68,8 @@ class NoiseRepetition(nn.Module):
             self._allocate(shape)
         device = self.cdf.device
         fresh = torch.randn(shape, generator=self.generator, device=device)
-        uniform = torch.rand(
-            self.count.shape,
-            generator=self.generator,
-            device=device,
-            dtype=torch.float64,
-        )
+        options = {"generator": self.generator, "device": device}
+        uniform = torch.rand(self.count.shape, dtype=torch.float64, **options)
         # first index with u < cdf
         drawn = torch.searchsorted(self.cdf, uniform, right=True) + 1
         drawn = drawn.clamp_max(self.cdf.shape[0])
@@ -91,11 +83,9 @@ class NoiseRepetition(nn.Module):
         return (1, 1) if self.clock == "shared" else (shape[0], shape[1])
 
     def _allocate(self, shape: tuple[int, int, int]) -> None:
-        clocks = self._clocks(shape)
-        device = self.cdf.device
-        self.noise = torch.zeros(shape, device=device)
-        self.count = torch.zeros(clocks, dtype=torch.int64, device=device)
-        self.length = torch.zeros(clocks, dtype=torch.int64, device=device)
+        self.noise = self.cdf.new_zeros(shape, dtype=torch.get_default_dtype())
+        self.count = self.cdf.new_zeros(self._clocks(shape), dtype=torch.int64)
+        self.length = torch.zeros_like(self.count)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from flashdex.modules.layers import Mode
+from flashdex.modules.layers import Mode, held
 from flashdex.modules.product import product
 
 KERNELS = (1, 4, 2)
@@ -58,24 +58,15 @@ class FutureEncoder(nn.Module):
             torch.empty(ensemble, out, fan_in) for fan_in, out in sizes
         )
         self.biases = nn.ParameterList(torch.empty(ensemble, out) for _, out in sizes)
-        self.reset_parameters()
-
-    @torch.no_grad()
-    def reset_parameters(self) -> None:
-        """Draw weights and biases from U(-1, 1) / sqrt(fan_in)."""
         for weight, bias in zip(self.weights, self.biases, strict=True):
             bound = 1.0 / math.sqrt(weight.shape[-1])
-            weight.uniform_(-bound, bound)
-            bias.uniform_(-bound, bound)
+            nn.init.uniform_(weight, -bound, bound)
+            nn.init.uniform_(bias, -bound, bound)
 
     def forward(self, future: Tensor, *, mode: Mode = "train") -> Tensor:
         """Encode ``future`` (B, C, K) to (E, B, latent_dim)."""
-        weights, biases = list(self.weights), list(self.biases)
-        if mode == "frozen":
-            weights, biases = (
-                [w.detach() for w in weights],
-                [b.detach() for b in biases],
-            )
+        weights = [held(weight, mode) for weight in self.weights]
+        biases = [held(bias, mode) for bias in self.biases]
         # frames before channels: each convolution is one product
         frames = future.mT.flatten(0, 1).unsqueeze(0)
         x = product(frames, weights[0].flatten(0, 1)[None], biases[0].flatten()[None])
@@ -87,18 +78,11 @@ class FutureEncoder(nn.Module):
 
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor, *, stride: int) -> Tensor:
-    """Convolution over frames: every frame group times every tap, then a shifted sum.
+    """(E, B, K, C) to (E, B, (K - kernel) // stride + 1, d): a convolution over frames.
 
-    Groups of ``stride`` frames do not overlap, so no window has to be copied out.
-
-    Args:
-        x: (E, B, K, C).
-        weight: (E, d, C kernel), the kernel a multiple of ``stride``.
-        bias: (E, d).
-        stride: frames between two windows.
-
-    Returns:
-        (E, B, (K - kernel) // stride + 1, d).
+    Every frame group times every tap, then a shifted sum. Groups of ``stride`` frames
+    do not overlap, so no window has to be copied out. The weight is (E, d, C kernel),
+    the kernel a multiple of ``stride``.
     """
     ensemble, batch, frames, channels = x.shape
     groups = frames // stride

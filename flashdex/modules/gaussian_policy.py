@@ -82,24 +82,13 @@ class GaussianPolicy(nn.Module):
     def forward(
         self, observation: Tensor, future: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the actions, (B, A) each.
-
-        Args:
-            observation: (B, D).
-            future: (B, C, K), if there is an encoder.
-        """
+        """Mean and std (B, A) of an observation (B, D) and a window (B, C, K)."""
         mean = self.body(observation, future)
         return mean, self.log_std.exp().expand_as(mean)
 
 
 class ValueNet(nn.Module):
-    """Expected discounted return of a state.
-
-    Args:
-        observation_dim: width D of the normalised observation.
-        hidden: widths of the hidden layers.
-        encoder: encoder of the future window with ``ensemble=1``, or None.
-    """
+    """Expected discounted return of a state; see `GaussianPolicy` for the arguments."""
 
     def __init__(
         self,

@@ -25,15 +25,29 @@ Mode = Literal["train", "eval", "frozen"]
 NORM_EPS = 1e-8
 
 
-class UnitLinear(nn.Module):
+def held(parameter: Tensor, mode: Mode) -> Tensor:
+    """The parameter; without gradient when ``mode`` is frozen."""
+    return parameter.detach() if mode == "frozen" else parameter
+
+
+class PlainLinear(nn.Module):
+    """``y = x W^T`` of E members, without projection; weights start at zero."""
+
+    def __init__(
+        self, in_features: int, out_features: int, *, ensemble: int = 1
+    ) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(ensemble, out_features, in_features))
+
+    def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
+        """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
+        return product(x, held(self.weight, mode))
+
+
+class UnitLinear(PlainLinear):
     """Linear map without bias whose rows have unit length after each projection.
 
-    ``y = x W^T`` per ensemble member (FlashSAC, table of primitive layers).
-
-    Args:
-        in_features: size of the input.
-        out_features: size of the output.
-        ensemble: number of members E.
+    Starts orthogonal (FlashSAC, table of primitive layers).
 
     Example:
         >>> layer = UnitLinear(3, 5, ensemble=2)
@@ -44,20 +58,11 @@ class UnitLinear(nn.Module):
     def __init__(
         self, in_features: int, out_features: int, *, ensemble: int = 1
     ) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(ensemble, out_features, in_features))
+        super().__init__(in_features, out_features, ensemble=ensemble)
         for member in self.weight.detach():
             nn.init.orthogonal_(member)
         # orthogonal rows are not unit rows when out_features > in_features
         self.project_()
-
-    def parameter(self, mode: Mode) -> Tensor:
-        """The weight (E, out_features, in_features); detached when frozen."""
-        return self.weight.detach() if mode == "frozen" else self.weight
-
-    def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
-        """Map ``x`` (E, B, in_features) to (E, B, out_features)."""
-        return product(x, self.parameter(mode))
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -76,27 +81,18 @@ def dense_relu(
 ) -> Tensor:
     """``relu(norm(linear(x)))`` for E members.
 
-    With running statistics the normalisation is affine and moves into the weights.
-
-    Args:
-        linear: linear map without bias.
-        norm: BatchNorm of its output.
-        x: input, (E, B, in_features).
-        mode: see `Mode`.
-        keep: rows of the batch to return; all rows enter the batch statistics.
-
-    Returns:
-        (E, rows, out_features).
+    With running statistics the normalisation is affine and moves into the weights. From
+    (E, B, in_features) to (E, rows, out_features): only the rows ``keep`` are returned,
+    all of them enter the batch statistics.
     """
     if mode == "train":
-        gamma, beta = norm.affine(mode)
         out, mean, var = linear_norm_relu(
-            x, linear.parameter(mode), gamma, beta, eps=norm.eps, keep=keep
+            x, linear.weight, norm.weight, norm.bias, eps=norm.eps, keep=keep
         )
         norm.track_(mean, var, x.shape[1])
         return out
     scale, shift = norm.running_affine(mode)
-    weight = linear.parameter(mode) * scale.unsqueeze(-1)
+    weight = held(linear.weight, mode) * scale.unsqueeze(-1)
     x = x if keep is None else x[:, keep]
     return product(x, weight, shift, relu=True)
 
@@ -143,21 +139,9 @@ class UnitBatchNorm(nn.Module):
         self.register_buffer("running_var", torch.ones(ensemble, features))
         self.register_buffer("num_tracked", torch.zeros(ensemble, 1))
 
-    def affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
-        """Gamma and beta, (E, d) each; without gradient when ``mode`` is frozen."""
-        if mode == "frozen":
-            return self.weight.detach(), self.bias.detach()
-        return self.weight, self.bias
-
     @torch.no_grad()
     def track_(self, mean: Tensor, var: Tensor, count: int) -> None:
-        """Move the running statistics towards biased batch statistics, in place.
-
-        Args:
-            mean: batch mean, (E, d) or (d,).
-            var: biased batch variance, (E, d) or (d,).
-            count: rows of the batch.
-        """
+        """Move the running statistics towards those, (E, d), of ``count`` rows."""
         unbiased = var.detach() * (count / max(count - 1, 1))
         mean = mean.detach().expand_as(self.running_mean)
         rate: Tensor | float = self.momentum
@@ -169,8 +153,8 @@ class UnitBatchNorm(nn.Module):
 
     def running_affine(self, mode: Mode) -> tuple[Tensor, Tensor]:
         """``scale, shift`` (E, d) of the running form ``y = scale x + shift``."""
-        gamma, beta = self.affine(mode)
-        scale = gamma * torch.rsqrt(self.running_var + self.eps)
+        scale = held(self.weight, mode) * torch.rsqrt(self.running_var + self.eps)
+        beta = held(self.bias, mode)
         return scale, torch.addcmul(beta, scale, self.running_mean, value=-1)
 
     @torch.no_grad()
@@ -183,12 +167,7 @@ class UnitBatchNorm(nn.Module):
 
 
 class UnitRMSNorm(nn.Module):
-    """``x rsqrt(mean(x^2) + 1e-6) g`` over the last axis, norm of g is sqrt(d).
-
-    Args:
-        features: size d of the last axis.
-        ensemble: number of members E.
-    """
+    """``x rsqrt(mean(x^2) + 1e-6) g`` over the last axis, norm of g is sqrt(d)."""
 
     def __init__(self, features: int, *, ensemble: int = 1, eps: float = 1e-6) -> None:
         super().__init__()
@@ -197,9 +176,8 @@ class UnitRMSNorm(nn.Module):
 
     def forward(self, x: Tensor, *, mode: Mode = "train") -> Tensor:
         """Normalise ``x`` (E, B, d) over its last axis."""
-        weight = self.weight.detach() if mode == "frozen" else self.weight
         scale = torch.rsqrt(x.square().mean(-1, keepdim=True) + self.eps)
-        return x * scale * weight[:, None]
+        return x * scale * held(self.weight, mode)[:, None]
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -224,10 +202,6 @@ def warm_up_statistics(module: nn.Module) -> None:
 
 def restore_generator(generator: torch.Generator, state: Tensor) -> bool:
     """Set a generator to a stored state, unless that is one of another device.
-
-    Args:
-        generator: to set.
-        state: what ``get_state`` of a generator returned.
 
     Returns:
         Whether it was set. Otherwise the generator goes on from its seed, as a run does

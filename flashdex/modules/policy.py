@@ -48,12 +48,11 @@ class FlashPolicy(TensorDictModuleBase):
         self.deterministic_key = deterministic_key
         self.actor = actor
         self.noise = NoiseRepetition() if noise is None else noise
-        self.has_future = actor.future_encoder is not None
-        reads: list[Any] = [observation, future]
+        keys: list[Any] = [observation, future]
+        self.in_keys = keys if actor.future_encoder is not None else keys[:1]
         writes: list[Any] = [action]
         if groups is not None:
             writes = [(group, action) for group in groups]
-        self.in_keys = reads if self.has_future else reads[:1]
         self.out_keys = writes
 
     @torch.no_grad()
@@ -85,11 +84,6 @@ def sample_squashed(mean: Tensor, std: Tensor, noise: Tensor) -> tuple[Tensor, T
     ``a = tanh(u)``, ``u = mean + std eps``;
     ``log pi = sum_j log N(u_j) - 2 (log 2 - u_j - softplus(-2 u_j))``: exact, without
     an epsilon inside the logarithm.
-
-    Args:
-        mean: (..., A).
-        std: (..., A), positive.
-        noise: standard normal draws eps, (..., A).
 
     Returns:
         Action in [-1, 1], (..., A), and log-density, (...).

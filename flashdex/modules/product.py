@@ -28,10 +28,8 @@ def bfloat16_products(enabled: bool = True) -> Iterator[None]:
     """Round both operands and the result of large float32 products to bfloat16.
 
     It holds for what this thread computes inside, and for its gradients. Everything
-    else stays in float32: statistics, normalisation, softmax, losses, weights.
-
-    Args:
-        enabled: False changes nothing.
+    else stays in float32: statistics, normalisation, softmax, losses, weights. With
+    ``enabled=False`` nothing changes.
     """
     before = are_bfloat16()
     _state.lowered = enabled or before
@@ -46,9 +44,7 @@ def tf32_products(enabled: bool = True) -> Iterator[None]:
     """Compute float32 products of a GPU in TF32 inside, and those after it as before.
 
     Small products elsewhere, rotations of rewards and observations, keep all digits.
-
-    Args:
-        enabled: False changes nothing.
+    With ``enabled=False`` nothing changes.
     """
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if enabled else before)
@@ -74,15 +70,8 @@ def multiply(
 ) -> Tensor:
     """``x W^T + bias`` and optionally relu, without gradient.
 
-    Args:
-        x: (E, B, K), any strides.
-        weight: (E, N, K), any strides.
-        bias: (E, N), or None.
-        relu: whether negative results become zero.
-        lowered: see `bfloat16_products`.
-
-    Returns:
-        (E, B, N), contiguous.
+    ``x`` is (E, B, K), the weight (E, N, K), the bias (E, N), of any strides; the
+    result (E, B, N) is contiguous. For ``lowered`` see `bfloat16_products`.
     """
     large = _is_large_float32(x, weight)
     if large and lowered:
@@ -192,14 +181,7 @@ def product(
 ) -> Tensor:
     """Differentiable ``x W^T + bias`` of E members, optionally with relu.
 
-    Args:
-        x: (E, B, K).
-        weight: (E, N, K).
-        bias: (E, N), or None.
-        relu: whether negative results become zero.
-
-    Returns:
-        (E, B, N).
+    ``x`` is (E, B, K), the weight (E, N, K), the bias (E, N); the result (E, B, N).
 
     Example:
         >>> product(torch.ones(2, 7, 3), torch.ones(2, 5, 3)).shape

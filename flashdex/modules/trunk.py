@@ -19,12 +19,7 @@ EXPANSION = 4
 
 
 class FlashBlock(nn.Module):
-    """``x + relu(BN(W2 relu(BN(W1 x))))`` with W1: d -> 4d and W2: 4d -> d.
-
-    Args:
-        width: size d of the residual stream.
-        ensemble: number of members E.
-    """
+    """``x + relu(BN(W2 relu(BN(W1 x))))`` with W1: d -> 4d and W2: 4d -> d."""
 
     def __init__(self, width: int, *, ensemble: int = 1) -> None:
         super().__init__()
@@ -42,14 +37,7 @@ class FlashBlock(nn.Module):
 
 
 class FlashTrunk(nn.Module):
-    """Embed, N residual blocks and one RMSNorm, for E members at once.
-
-    Args:
-        in_features: total width of the input parts.
-        width: size d of the residual stream.
-        num_blocks: number N of residual blocks, at least one.
-        ensemble: number of members E.
-        column_mask: see `InputEmbed`.
+    """Embed, N residual blocks of width d and one RMSNorm, for E members at once.
 
     Example:
         >>> trunk = FlashTrunk(5, 8, ensemble=2)
@@ -78,15 +66,9 @@ class FlashTrunk(nn.Module):
     def forward(
         self, parts: Sequence[Tensor], *, mode: Mode, keep: slice | None = None
     ) -> Tensor:
-        """Features of the concatenated parts.
+        """Features (E, B, width) of the parts, (B, d_i) shared or (E, B, d_i).
 
-        Args:
-            parts: tensors (B, d_i) shared by the members or (E, B, d_i).
-            mode: see `flashdex.modules.layers.Mode`.
-            keep: rows to return; every row enters the batch statistics.
-
-        Returns:
-            (E, B, width), or fewer rows with ``keep``.
+        Only the rows ``keep`` are returned; all of them enter the batch statistics.
         """
         x = self.embed(parts, mode=mode)
         last = len(self.blocks) - 1

@@ -11,25 +11,15 @@ from torch import Tensor
 
 
 class FlashBatch(NamedTuple):
-    """B transitions; observations hold s in the first B rows and s' in the last B.
+    """B transitions; observations hold s in the first B rows and s' in the last B."""
 
-    Attributes:
-        observation: (2B, D).
-        future: (2B, C, K), or None.
-        action: joint action of all groups, (B, G A).
-        reward: scaled n-step reward, (G, B).
-        discount: gamma^k with the true window length k, (B,).
-        terminated: 1 where the window ends in a true termination, (B,).
-        weight: 1 where a group takes part, (G, B), or None for everywhere.
-    """
-
-    observation: Tensor
-    future: Tensor | None
-    action: Tensor
-    reward: Tensor
-    discount: Tensor
-    terminated: Tensor
-    weight: Tensor | None
+    observation: Tensor  # (2B, D)
+    future: Tensor | None  # (2B, C, K)
+    action: Tensor  # joint action of all groups, (B, G A)
+    reward: Tensor  # scaled n-step reward, (G, B)
+    discount: Tensor  # gamma^k with the true window length k, (B,)
+    terminated: Tensor  # 1 where the window ends in a true termination, (B,)
+    weight: Tensor | None  # 1 where a group takes part, (G, B); None is everywhere
 
     @property
     def size(self) -> int:
@@ -67,12 +57,7 @@ def read_windows(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def masked_mean(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over the last axis of the entries that count; zero if none does.
-
-    Args:
-        values: (..., B).
-        weight: 0 or 1, broadcastable to ``values``, or None.
-    """
+    """Mean over the last axis of the entries of weight 1; zero if there are none."""
     if weight is None:
         return values.mean(-1)
     # select, not multiply: an entry that does not count may be anything

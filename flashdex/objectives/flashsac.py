@@ -1,4 +1,17 @@
-"""FlashSAC over groups: one actor and one categorical twin critic per group."""
+"""FlashSAC over groups: one actor and one categorical twin critic per group.
+
+Each network is called with an explicit BatchNorm mode:
+
+==============  ==============  ===========  ===========================
+objective       network         mode         rows fed
+==============  ==============  ===========  ===========================
+actor           actor           train        s and s', first half kept
+actor           critic          frozen       s with fresh actions
+target          actor           eval         s'
+target          target critic   train        both, second half kept
+critic          critic          train        both, first half kept
+==============  ==============  ===========  ===========================
+"""
 
 from __future__ import annotations
 
@@ -14,9 +27,10 @@ from torchrl.objectives import LossModule
 
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
-from flashdex.modules.policy import target_entropy
+from flashdex.modules.policy import sample_squashed, target_entropy
 from flashdex.objectives.batch import (
     FlashBatch,
+    masked_mean,
     nested,
     read_pair,
     read_windows,
@@ -24,11 +38,12 @@ from flashdex.objectives.batch import (
 )
 from flashdex.objectives.reward_normalizer import RewardNormalizer
 from flashdex.objectives.terms import (
-    Metrics,
-    actor_objective,
-    alpha_objective,
-    qvalue_objective,
+    categorical_projection,
+    own_action_views,
+    side_by_side,
 )
+
+Metrics = dict[str, Tensor]
 
 
 class FlashSACLoss(LossModule):
@@ -104,9 +119,8 @@ class FlashSACLoss(LossModule):
         self.reward_normalizer = reward_normalizer
         self.gamma, self.n_steps, self.exact_discount = gamma, n_steps, exact_discount
         self.own_action_gate = own_action_gate
-        self.log_alpha = nn.Parameter(
-            torch.full((len(self.groups),), float(alpha_init)).log()
-        )
+        alpha = torch.full((len(self.groups),), float(alpha_init))
+        self.log_alpha = nn.Parameter(alpha.log())
         encoders = (actor_network.future_encoder, qvalue_network.future_encoder)
         self._reads_future = any(encoder is not None for encoder in encoders)
         self.target_entropy = target_entropy(actor_network.action_dim, target_sigma)
@@ -123,9 +137,8 @@ class FlashSACLoss(LossModule):
         self, prefix: str = "", recurse: bool = True, remove_duplicate: bool = True
     ) -> Iterator[tuple[str, nn.Parameter]]:
         """Trained parameters; those of the target are left out."""
-        for name, parameter in nn.Module.named_parameters(
-            self, prefix, recurse, remove_duplicate
-        ):
+        options = (prefix, recurse, remove_duplicate)
+        for name, parameter in nn.Module.named_parameters(self, *options):
             if "target_qvalue_network" not in name:
                 yield name, parameter
 
@@ -141,8 +154,6 @@ class FlashSACLoss(LossModule):
             names.append(nested(group, keys.action))
             names.append(nested("next", nested(group, keys.reward)))
         return names
-
-    # -- from TensorDict to tensors -------------------------------------------
 
     @torch.no_grad()
     def read(self, tensordict: TensorDictBase) -> FlashBatch:
@@ -169,50 +180,17 @@ class FlashSACLoss(LossModule):
             weight=None if mask is None else mask.mT.to(reward.dtype),
         )
 
-    # -- the three pieces ------------------------------------------------------
-
     def actor_loss(
         self, tensordict: TensorDictBase, *, noise: Tensor | None = None
     ) -> tuple[Tensor, Metrics]:
-        """``sum_g mean_B [alpha_g log pi_g - min_m Q_gm(s, [a_g, sg(a_other)])]``.
-
-        Args:
-            tensordict: sampled batch.
-            noise: standard normal draws (G, B, A); default fresh ones.
-
-        Returns:
-            Loss () and per-group ``loss_actor``, ``entropy``, ``q_value`` (G,) as well
-            as ``log_prob`` (G, B), detached.
-        """
-        return self.actor_objective(
-            self.read(tensordict), self._noise(tensordict, noise)
-        )
-
-    def alpha_loss(
-        self, log_prob: Tensor, weight: Tensor | None = None
-    ) -> tuple[Tensor, Metrics]:
-        """``sum_g alpha_g (H_g - H_target)`` with ``H_g = -mean_B log pi_g``.
-
-        Args:
-            log_prob: of the actor loss, (G, B).
-            weight: entries that count, (G, B), or None.
-        """
-        return alpha_objective(
-            self.log_alpha, log_prob, weight, target_entropy=self.target_entropy
-        )
+        """`actor_objective` of a sampled batch; the noise is drawn where not given."""
+        noise = self._noise(tensordict, noise)
+        return self.actor_objective(self.read(tensordict), noise)
 
     def qvalue_loss(
         self, tensordict: TensorDictBase, *, noise: Tensor | None = None
     ) -> tuple[Tensor, Metrics]:
-        """Cross-entropy to the projected target, mean over groups, members and batch.
-
-        Args:
-            tensordict: sampled batch.
-            noise: standard normal draws (G, B, A) of the next action.
-
-        Returns:
-            Loss () and per-group ``loss_qvalue``, ``td_error``, ``clip_fraction`` (G,).
-        """
+        """`qvalue_objective` of a sampled batch; the noise is drawn where not given."""
         noise = self._noise(tensordict, noise)
         return self.qvalue_objective(self.read(tensordict), noise)
 
@@ -234,37 +212,124 @@ class FlashSACLoss(LossModule):
             }
         )
 
-    # -- the same on tensors, for steppers and compilers ------------------------
-
-    def actor_objective(
-        self, batch: FlashBatch, noise: Tensor
-    ) -> tuple[Tensor, Metrics]:
-        """`actor_loss` of a batch that is already read."""
-        return actor_objective(
-            self.actor_network,
-            self.qvalue_network,
-            self.log_alpha,
-            batch,
-            noise,
-            own_action_gate=self.own_action_gate,
-        )
-
-    def qvalue_objective(
-        self, batch: FlashBatch, noise: Tensor
-    ) -> tuple[Tensor, Metrics]:
-        """`qvalue_loss` of a batch that is already read."""
-        return qvalue_objective(
-            self.actor_network,
-            self.qvalue_network,
-            self.target_qvalue_network,
-            self.log_alpha,
-            batch,
-            noise,
-        )
-
     def _noise(self, tensordict: TensorDictBase, noise: Tensor | None) -> Tensor:
         if noise is not None:
             return noise
         action = tensordict.get(nested(self.groups[0], self.tensor_keys.action))
         shape = (len(self.groups), action.shape[0], self.actor_network.action_dim)
         return torch.randn(shape, dtype=action.dtype, device=action.device)
+
+    # -- on plain tensors: what a compiler sees ---------------------------------
+
+    def actor_objective(
+        self, batch: FlashBatch, noise: Tensor
+    ) -> tuple[Tensor, Metrics]:
+        """``sum_g mean_B [alpha_g log pi_g - min_m Q_gm(s, [a_g, sg(a_other)])]``.
+
+        Critics and temperatures receive no gradient.
+
+        Args:
+            batch: sampled transitions.
+            noise: standard normal draws, (G, B, A).
+
+        Returns:
+            Loss () and detached ``loss_actor``, ``entropy``, ``q_value`` (G,) as well
+            as ``log_prob`` (G, B).
+        """
+        observation, _, future, _ = batch.split()
+        # both halves of the batch enter the statistics, only the first the loss
+        mean, std = self.actor_network(
+            batch.observation, batch.future, mode="train", keep=slice(0, batch.size)
+        )
+        action, log_prob = sample_squashed(mean, std, noise)
+        views = own_action_views if self.own_action_gate else side_by_side
+        log_p = self.qvalue_network(observation, views(action), future, mode="frozen")
+        value = self.qvalue_network.expected_value(log_p).amin(1)
+        alpha = self.log_alpha.detach().exp()[:, None]
+        loss = masked_mean(alpha * log_prob - value, batch.weight)
+        metrics = {
+            "loss_actor": loss.detach(),
+            "entropy": -masked_mean(log_prob.detach(), batch.weight),
+            "q_value": masked_mean(value.detach(), batch.weight),
+            "log_prob": log_prob.detach(),
+        }
+        return loss.sum(), metrics
+
+    def alpha_loss(
+        self, log_prob: Tensor, weight: Tensor | None = None
+    ) -> tuple[Tensor, Metrics]:
+        """``sum_g alpha_g (H_g - H_target)`` with ``H_g = -mean_B log pi_g``.
+
+        Args:
+            log_prob: of the actor loss, (G, B).
+            weight: 1 where a group takes part, (G, B), or None.
+
+        Returns:
+            Loss (), and detached metrics (G,).
+        """
+        excess = -masked_mean(log_prob.detach(), weight) - self.target_entropy
+        if weight is not None:
+            excess = torch.where(weight.sum(-1) > 0, excess, 0.0)
+        alpha = self.log_alpha.exp()
+        loss = alpha * excess
+        return loss.sum(), {"loss_alpha": loss.detach(), "alpha": alpha.detach()}
+
+    @torch.no_grad()
+    def backup(self, batch: FlashBatch, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Categorical target of every group and the actions it was computed with.
+
+        A group bootstraps with its own entropy, at the joint next action of all towers;
+        the least member is chosen by its expected value and its whole distribution is
+        used.
+
+        Returns:
+            Target distributions (G, B, Z) and joint actions at s and s' (2B, G A).
+        """
+        critic, size = self.target_qvalue_network, batch.size
+        _, after, _, next_future = batch.split()
+        mean, std = self.actor_network(after, next_future, mode="eval")
+        next_action, log_prob = sample_squashed(mean, std, noise)
+        joint = torch.cat([batch.action, side_by_side(next_action)])
+        half = slice(size, 2 * size)
+        log_p = critic(batch.observation, joint, batch.future, mode="train", keep=half)
+        least = critic.expected_value(log_p).argmin(1)  # members, never groups
+        index = least[:, None, :, None].expand(-1, 1, -1, critic.num_atoms)
+        target = categorical_projection(
+            log_p.gather(1, index).squeeze(1).exp(),
+            reward=batch.reward,
+            discount=batch.discount,
+            terminated=batch.terminated,
+            entropy_cost=self.log_alpha.exp()[:, None] * log_prob,
+            v_max=critic.v_max,
+        )
+        return target, joint
+
+    def qvalue_objective(
+        self, batch: FlashBatch, noise: Tensor
+    ) -> tuple[Tensor, Metrics]:
+        """``-sum_z m(z) log p(z | s, a)``, mean over groups, members and valid rows.
+
+        Actor and temperatures are those that were already stepped in this update.
+
+        Args:
+            batch: sampled transitions.
+            noise: standard normal draws of the next action, (G, B, A).
+
+        Returns:
+            Loss () and detached ``loss_qvalue``, ``td_error``, ``clip_fraction`` (G,).
+        """
+        target, joint = self.backup(batch, noise)
+        critic, half = self.qvalue_network, slice(0, batch.size)
+        log_p = critic(batch.observation, joint, batch.future, mode="train", keep=half)
+        cross_entropy = -(target[:, None] * log_p).sum(-1)
+        weight = None if batch.weight is None else batch.weight[:, None]
+        per_member = masked_mean(cross_entropy, weight)
+        with torch.no_grad():
+            error = target @ critic.atoms - critic.expected_value(log_p).mean(1)
+            ends = target[..., 0] + target[..., -1]
+            metrics = {
+                "loss_qvalue": per_member.mean(1),
+                "td_error": masked_mean(error.abs(), batch.weight),
+                "clip_fraction": masked_mean(ends, batch.weight),
+            }
+        return per_member.mean(), metrics

@@ -17,26 +17,12 @@ from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
 
 # A wide observation leaves room for small steps only: rates near 1e-5 are usual.
 LR_FACTOR, LR_RANGE = 1.5, (1e-6, 1e-2)
-METRICS = (
-    "loss_policy",
-    "loss_value",
-    "entropy",
-    "kl",
-    "ratio_clipped",
-    "explained_variance",
-    "gradient_norm",
-)
+METRICS = ("loss_policy", "loss_value", "entropy", "kl", "ratio_clipped")
+METRICS += ("explained_variance", "gradient_norm")
 
 
 def bootstrap_rows(done: Tensor) -> Tensor:
-    """Rows of a rollout whose next state is not the next row: ends and the last step.
-
-    Args:
-        done: (N, T) bool.
-
-    Returns:
-        (N, T) bool.
-    """
+    """Rows (N, T) whose next state is not the next row: ends and the last step."""
     rows = done.clone()
     rows[:, -1] = True
     return rows
@@ -130,11 +116,8 @@ class PPO:
         )
         self.parameters = [*policy.parameters(), *value.parameters()]
         # As a tensor the rate is steered without waiting for the device.
-        self.optimizer = torch.optim.Adam(
-            self.parameters,
-            lr=torch.tensor(lr, device=policy.log_std.device),
-            fused=True,
-        )
+        rate = torch.tensor(lr, device=policy.log_std.device)
+        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True)
 
     def _make_loss(self, **options: Any) -> _ClipLoss:
         actor = ProbabilisticActor(
@@ -143,9 +126,8 @@ class PPO:
             distribution_class=IndependentNormal,
         )
         critic = TensorDictModule(self.value, self.in_keys, ["state_value"])
-        loss = _ClipLoss(
-            actor, critic, loss_critic_type="l2", functional=False, **options
-        )
+        options |= {"loss_critic_type": "l2", "functional": False}
+        loss = _ClipLoss(actor, critic, **options)
         loss.set_keys(action="action", sample_log_prob="log_prob")
         if options["clip_value"] is not None:
             # as a buffer it would be read on the host at every step
@@ -201,9 +183,8 @@ class PPO:
         sums: dict[str, Tensor] = defaultdict(lambda: zero)
         steps = 0
         for _ in range(self.epochs if len(rows) else 0):
-            order = torch.randperm(
-                len(rows), generator=self.generator, device=zero.device
-            )
+            options = {"generator": self.generator, "device": zero.device}
+            order = torch.randperm(len(rows), **options)
             for chosen in order.chunk(self.minibatches):
                 for name, metric in self._step(rows[chosen], steps == 0).items():
                     sums[name] = sums[name] + metric.detach().mean()
@@ -228,16 +209,15 @@ class PPO:
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        values = (
-            out["loss_objective"],
-            out["loss_critic"],
-            out["entropy"],
-            kl,
-            out["clip_fraction"],
-            out["explained_variance"],
-            norm,
-        )
-        return dict(zip(METRICS, values, strict=True))
+        return {
+            "loss_policy": out["loss_objective"],
+            "loss_value": out["loss_critic"],
+            "entropy": out["entropy"],
+            "kl": kl,
+            "ratio_clipped": out["clip_fraction"],
+            "explained_variance": out["explained_variance"],
+            "gradient_norm": norm,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Networks and optimiser; the generator belongs to the caller."""

@@ -46,13 +46,11 @@ class RewardNormalizer(nn.Module):
         super().__init__()
         self.gamma, self.bound = gamma, bound
         # double: float32 stops counting at 2^24 rows
-        zeros = torch.zeros(num_groups, dtype=torch.float64)
         returns = torch.zeros(num_envs, num_groups, dtype=torch.float64)
         self.register_buffer("returns", returns)
-        self.register_buffer("returns_max", zeros.clone())
-        self.register_buffer("mean", zeros.clone())
-        self.register_buffer("var", torch.ones_like(zeros))
-        self.register_buffer("count", zeros.clone())
+        for name in ("returns_max", "mean", "var", "count"):
+            self.register_buffer(name, torch.zeros(num_groups, dtype=torch.float64))
+        self.var.fill_(1.0)
 
     @torch.no_grad()
     def update(self, reward: Tensor, done: Tensor, mask: Tensor | None = None) -> None:
@@ -64,9 +62,8 @@ class RewardNormalizer(nn.Module):
             mask: entries that count, (N, G) bool; default all.
         """
         alive = 1.0 - done.reshape(-1, 1).to(self.returns.dtype)
-        weight = (
-            torch.ones_like(self.returns) if mask is None else mask.to(self.returns)
-        )
+        all_count = torch.ones_like(self.returns)
+        weight = all_count if mask is None else mask.to(self.returns)
         # the done of this step wipes the past before its reward is added
         returns = (self.gamma * alive * self.returns + reward) * weight
         self.returns.copy_(returns)

@@ -2,20 +2,82 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from flashdex.modules.layers import project_, restore_generator
 from flashdex.modules.product import bfloat16_products
 from flashdex.objectives.batch import FlashBatch, nested
-from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.objectives.optim import ScheduledAdam, TargetAverage
-from flashdex.objectives.terms import Metrics
+from flashdex.objectives.flashsac import FlashSACLoss, Metrics
 
 ACTOR_METRICS = ("loss_actor", "entropy", "q_value", "loss_alpha", "alpha")
+
+
+def cosine_rate(step: int, total: int | None, *, peak: float, end: float) -> float:
+    """``end + (peak - end) / 2 (1 + cos(pi step / total))``; constant without a total.
+
+    Args:
+        step: steps already taken by this optimiser.
+        total: horizon, the number of critic updates of the run; None is constant.
+        peak: first learning rate.
+        end: last learning rate.
+    """
+    if total is None:
+        return peak
+    phase = math.pi * min(step, total) / total
+    return end + 0.5 * (peak - end) * (1.0 + math.cos(phase))
+
+
+class ScheduledAdam:
+    """Adam (.9, .999, 1e-8, no decay) that advances its own cosine once a step.
+
+    Args:
+        parameters: what to train.
+        peak: first learning rate.
+        end: last learning rate.
+        total: horizon of the cosine in critic updates; None keeps ``peak``.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        *,
+        peak: float = 3e-4,
+        end: float = 1.5e-4,
+        total: int | None = None,
+    ) -> None:
+        self.peak, self.end, self.total = peak, end, total
+        self.steps = 0
+        self.adam = torch.optim.Adam(list(parameters), lr=peak, fused=True)
+
+    @property
+    def rate(self) -> float:
+        """Learning rate of the coming step."""
+        return cosine_rate(self.steps, self.total, peak=self.peak, end=self.end)
+
+    def step(self, loss: Tensor) -> None:
+        """Differentiate ``loss``, step, clear the gradients, advance the schedule."""
+        loss.backward()
+        for group in self.adam.param_groups:
+            group["lr"] = self.rate
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+        self.steps += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """Moments and schedule position."""
+        return {"adam": self.adam.state_dict(), "steps": self.steps}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict`."""
+        self.adam.load_state_dict(state["adam"])
+        self.steps = state["steps"]
 
 
 class FlashSACStepper:
@@ -42,6 +104,8 @@ class FlashSACStepper:
         >>> metrics = stepper.update(buffer.sample())
     """
 
+    _PARTS = ("loss", "actor_optimizer", "alpha_optimizer", "critic_optimizer")
+
     def __init__(
         self,
         loss: FlashSACLoss,
@@ -62,17 +126,20 @@ class FlashSACStepper:
         self.actor_period, self.actor_delay = actor_period, actor_delay
         self.generator = generator
         self.updates = 0
-        rates = {"peak": lr, "end": lr_end, "total": total_updates}
-        scale = actor_lr_scale
-        actor_rates = {**rates, "peak": scale * lr, "end": scale * lr_end}
-        self.actor_optimizer = ScheduledAdam(
-            loss.actor_network.parameters(), **actor_rates
-        )
-        self.alpha_optimizer = ScheduledAdam([loss.log_alpha], **rates)
-        self.critic_optimizer = ScheduledAdam(loss.qvalue_network.parameters(), **rates)
-        self.target_average = TargetAverage(
-            loss.qvalue_network, loss.target_qvalue_network, tau=tau
-        )
+
+        def adam(
+            parameters: Iterable[nn.Parameter], scale: float = 1.0
+        ) -> ScheduledAdam:
+            ends = {"peak": scale * lr, "end": scale * lr_end}
+            return ScheduledAdam(parameters, total=total_updates, **ends)
+
+        self.actor_optimizer = adam(loss.actor_network.parameters(), actor_lr_scale)
+        self.alpha_optimizer = adam([loss.log_alpha])
+        self.critic_optimizer = adam(loss.qvalue_network.parameters())
+        # parameters only: BatchNorm buffers of the target are its own
+        self._online = [p.detach() for p in loss.qvalue_network.parameters()]
+        self._target = [p.detach() for p in loss.target_qvalue_network.parameters()]
+        self._average = get_ema_multi_avg_fn(1.0 - tau)
         self._actor_objective = loss.actor_objective
         self._qvalue_objective = loss.qvalue_objective
         if compile:
@@ -111,9 +178,14 @@ class FlashSACStepper:
             qvalue, critic_metrics = self._qvalue_objective(batch, noise)
             self.critic_optimizer.step(qvalue)
         project_(self.loss.qvalue_network)
-        self.target_average.step()
+        self.average_target()
         self.updates += 1
         return self._report(critic_metrics, rate)
+
+    @torch.no_grad()
+    def average_target(self) -> None:
+        """``theta_t <- theta_t + tau (theta - theta_t)`` on parameters only."""
+        self._average(self._target, self._online, None)
 
     def _actor_step(self, batch: FlashBatch, noise: Tensor) -> None:
         loss, metrics = self._actor_objective(batch, noise)
@@ -128,17 +200,9 @@ class FlashSACStepper:
     def _draw(self, batch: FlashBatch, noise: Tensor | None) -> Tensor:
         if noise is not None:
             return noise
-        shape = (
-            len(self.loss.groups),
-            batch.size,
-            self.loss.actor_network.action_dim,
-        )
-        return torch.randn(
-            shape,
-            generator=self.generator,
-            dtype=batch.action.dtype,
-            device=batch.action.device,
-        )
+        shape = (len(self.loss.groups), batch.size, self.loss.actor_network.action_dim)
+        like = {"dtype": batch.action.dtype, "device": batch.action.device}
+        return torch.randn(shape, generator=self.generator, **like)
 
     def _report(self, critic_metrics: Metrics, rate: float) -> TensorDict:
         report = TensorDict({}, [])
@@ -150,10 +214,7 @@ class FlashSACStepper:
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact resume needs, the environments excepted."""
         state = {
-            "loss": self.loss.state_dict(),
-            "actor_optimizer": self.actor_optimizer.state_dict(),
-            "alpha_optimizer": self.alpha_optimizer.state_dict(),
-            "critic_optimizer": self.critic_optimizer.state_dict(),
+            **{name: getattr(self, name).state_dict() for name in self._PARTS},
             "updates": self.updates,
             "actor_metrics": dict(self._actor_metrics),
         }
@@ -163,10 +224,8 @@ class FlashSACStepper:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict`; the learner then continues bit-equal on the CPU."""
-        self.loss.load_state_dict(state["loss"])
-        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
-        self.alpha_optimizer.load_state_dict(state["alpha_optimizer"])
-        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        for name in self._PARTS:
+            getattr(self, name).load_state_dict(state[name])
         self.updates = state["updates"]
         metrics = state["actor_metrics"].items()
         self._actor_metrics = {k: v.to(self._zero.device) for k, v in metrics}

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from benchmarks import env as bench
-from benchmarks.common import duel
+from benchmarks.common import turns
 
 
 def test_bare_physics_follows_the_environment_bit_for_bit(make_env):
     env = make_env(3, evaluation=True, finger_mode="residual")
     env.forced_motion = torch.arange(3)
-    both = duel.Duel(env, num_threads=1)
+    both = turns.BareTurns(env, num_threads=1)
     for _ in range(2):  # 20 steps: no motion has ended, so no world was reset
-        segment = both.run()
-        assert segment.env > 0
-        assert segment.physics > 0
+        turn = both.run()
+        assert turn.env > 0
+        assert turn.physics > 0
         assert (both.bare.bind("qpos") == env.physics.batch.bind("qpos")).all()
         assert (
             both.bare.bind("sensordata") == env.physics.batch.bind("sensordata")
@@ -26,7 +26,7 @@ def test_bare_physics_follows_the_environment_bit_for_bit(make_env):
 
 
 def test_measure_gives_rates_and_their_ratio(make_env):
-    out = duel.measure(make_env(4), num_threads=1, seconds=0.1)
+    out = turns.measure(turns.BareTurns(make_env(4), num_threads=1), seconds=0.1)
     assert out["segments"] >= 3
     rates = out["env_steps_per_s"], out["physics_env_steps_per_s"]
     assert 0 < rates[0] < rates[1]

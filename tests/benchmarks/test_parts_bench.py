@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from benchmarks import replay, train
-from benchmarks.common import clock, turns
-from benchmarks.common.ceilings import gather_seconds, matmul_ceilings
+from benchmarks.common import output, turns
+from benchmarks.common.ceilings import gather_seconds, matmul_ceilings, seconds_each
 from flashdex.errors import FlashdexError
 
 CPU = torch.device("cpu")
@@ -27,13 +27,13 @@ def replay_words(words, monkeypatch):
     """The collection of the tests instead of a prepared one."""
     monkeypatch.setattr(replay, "PUSH", 64)
     monkeypatch.setattr(replay, "SOURCE_WORLDS", 4)
-    make = replay.compose_bench
+    make = output.compose_bench
 
     def compose(args, **options):
         args.objects = None
         return make(args, **options)
 
-    monkeypatch.setattr(replay, "compose_bench", compose)
+    monkeypatch.setattr(output, "compose_bench", compose)
     return words
 
 
@@ -95,12 +95,12 @@ def test_train_measures_loop_and_ceilings(words, capsys):
 def test_turns_begin_with_the_same_states_and_end_with_the_same(make_env):
     env = make_env(3, evaluation=True, finger_mode="residual")
     env.forced_motion = torch.arange(3)
-    taker = turns.TurnTaker(env, steps=6)  # no motion ends: no world is reset
+    both = turns.Turns(env, steps=6)  # no motion ends: no world is reset
     draw = env.generator.get_state()
-    targets, spent = taker.loop()
+    targets, spent = both.loop()
     after = env.physics.raw().qpos.clone()
     env.generator.set_state(draw)
-    alone = taker.replay(targets)
+    alone = both.replay(targets)
     assert torch.equal(env.physics.raw().qpos, after)
     assert spent > 0
     assert alone > 0
@@ -108,7 +108,7 @@ def test_turns_begin_with_the_same_states_and_end_with_the_same(make_env):
 
 
 def test_turns_give_rates_and_their_ratio(make_env):
-    found = turns.measure(make_env(4), seconds=0.1, steps=3)
+    found = turns.measure(turns.Turns(make_env(4), steps=3), seconds=0.1)
     assert found["segments"] >= 3
     assert 0 < found["env_steps_per_s"] < found["physics_env_steps_per_s"]
     assert turns.physics_rate(make_env(4), seconds=0.05, steps=3) > 0
@@ -117,12 +117,12 @@ def test_turns_give_rates_and_their_ratio(make_env):
 
 def test_a_call_is_timed_over_as_many_as_fit():
     calls = []
-    each = clock.seconds_each(lambda: calls.append(1), CPU, seconds=0.02)
+    each = seconds_each(lambda: calls.append(1), seconds=0.02)
     assert 0 < each < 0.02
     assert len(calls) > 10
     # one call that is longer than the time is still measured, after the first
     calls.clear()
-    clock.seconds_each(lambda: calls.append(1), CPU, seconds=0.0)
+    seconds_each(lambda: calls.append(1), seconds=0.0)
     assert len(calls) == 2
 
 

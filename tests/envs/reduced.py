@@ -9,12 +9,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from synthetic import FPS, make_box, make_frames
 
 from flashdex import keys
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from tests.synthetic import FPS, make_box, make_frames
 
 FRAMES = 60
 DISC = (0.0, 0.0, 0.0, 0.8, 0.02)  # m: x, y, top, radius, height

@@ -22,7 +22,7 @@ def test_autocast_stays_near_float32():
         for loss, flag in zip(losses, (False, True), strict=True)
     ]
     for seed in range(4):
-        td, _ = make_batch(SIZE, seed=seed)
+        td = make_batch(SIZE, seed=seed)
         noise = {n: torch.randn(1, 128, 3) for n in ("actor_noise", "target_noise")}
         exact, rounded = (stepper.update(td, **noise) for stepper in steppers)
         for name in ("loss_qvalue", "loss_actor", "entropy"):
@@ -47,7 +47,7 @@ def test_compiled_equals_eager_in_float32(autocast, tolerance):
         for loss, flag in zip(losses, (False, True), strict=True)
     )
     for seed in range(4):
-        td, _ = make_batch(SIZE, seed=seed)
+        td = make_batch(SIZE, seed=seed)
         shape = (SIZE.groups, SIZE.batch, SIZE.action)
         noise = {n: torch.randn(shape) for n in ("actor_noise", "target_noise")}
         a, b = eager.update(td, **noise), compiled.update(td, **noise)

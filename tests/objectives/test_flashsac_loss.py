@@ -6,7 +6,7 @@ import torch
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.reward_normalizer import RewardNormalizer
-from flashdex.objectives.terms import backup, own_action_views
+from flashdex.objectives.terms import own_action_views
 
 NETWORKS = ("actor_network", "qvalue_network", "target_qvalue_network")
 
@@ -131,9 +131,7 @@ def test_action_views_gate_exactly():
 def _target(loss, td, noise):
     batch = loss.read(td)
     state = {k: v.clone() for k, v in loss.state_dict().items()}
-    target, _ = backup(
-        loss.actor_network, loss.target_qvalue_network, loss.log_alpha, batch, noise
-    )
+    target, _ = loss.backup(batch, noise)
     loss.load_state_dict(state)
     return target
 

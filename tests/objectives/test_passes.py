@@ -7,7 +7,6 @@ import torch
 
 from flashdex.modules.policy import FlashPolicy, sample_squashed
 from flashdex.objectives.stepper import FlashSACStepper
-from flashdex.objectives.terms import backup
 
 NETWORKS = ("actor_network", "qvalue_network", "target_qvalue_network")
 SIZE, ACT, TAU = 16, 2, 0.1
@@ -74,10 +73,9 @@ def test_order_of_the_halves(make_loss, make_batch):
     assert (batch.observation[:SIZE] < 0).all()
     assert (batch.observation[SIZE:] > 0).all()
     critic = copy.deepcopy(loss.target_qvalue_network)
-    cold = torch.full((2,), -1e9)
-    target, joint = backup(
-        loss.actor_network, loss.target_qvalue_network, cold, batch, noise
-    )
+    with torch.no_grad():
+        loss.log_alpha.fill_(-1e9)  # zero temperature
+    target, joint = loss.backup(batch, noise)
     mean, std = loss.actor_network(td["next", "observation"], mode="eval")
     fresh, _ = sample_squashed(mean, std, noise)
     assert torch.equal(joint[:SIZE], torch.full((SIZE, 2 * ACT), 0.9))
@@ -102,9 +100,7 @@ def test_critic_loss_is_that_of_the_upper_half(make_loss, make_batch):
     batch, noise = loss.read(td), torch.randn(2, SIZE, ACT)
     critic = copy.deepcopy(loss.qvalue_network)
     state = {k: v.clone() for k, v in loss.state_dict().items()}
-    _, joint = backup(
-        loss.actor_network, loss.target_qvalue_network, loss.log_alpha, batch, noise
-    )
+    _, joint = loss.backup(batch, noise)
     loss.load_state_dict(state)
     value, _ = loss.qvalue_loss(td, noise=noise)
     log_p = critic(batch.observation, joint, mode="train")[:, :, :SIZE]

@@ -1,21 +1,22 @@
-"""The stacked learner against the loops of `per_hand_reference`, and recorded losses.
+"""The stacked learner against the plain one of `benchmarks`, and recorded losses.
 
-Three links: the loops with one hand give the published numbers of `test_golden_trace`;
-the learner with two hands equals the loops, parameters and running statistics included;
-and the losses that both gave are recorded, so that a change of the learner that a
-change of the loops follows is seen too.
+Three links: the plain learner with one hand gives the published numbers of
+`test_golden_trace`; the stacked one with two hands equals it, parameters and running
+statistics included; and the losses that both gave are recorded, so that a change of the
+stacked learner that a change of the plain one follows is seen too.
 """
 
 import pytest
 import torch
 from formulas import fill_networks, grid, observation
-from reference_runs import assert_runs_agree, make_reference, plain_batch
 from tensordict import TensorDict
 
+from benchmarks.common.plain_flashsac import PlainLearner, read_batch
 from flashdex.modules.actor import FlashActor
 from flashdex.modules.critic import EnsembleCritic
 from flashdex.modules.future import FutureEncoder
 from flashdex.objectives.flashsac import FlashSACLoss
+from flashdex.objectives.stepper import FlashSACStepper
 
 ROWS, OBS, ACT = 16, 5, 2
 SIDES = ("left", "right")
@@ -23,8 +24,8 @@ ALPHAS = (0.01, 0.02, 0.03)
 
 # ``_formula_loss``, ``_formula_batch`` and ``_formula_noise`` for two hands, float64,
 # the same batch in all eight updates, [left, right]. Written down on 2026-11-22 from a
-# run in which learner and loops differed by less than 1e-12. Actor values: updates 0,
-# 2, 4, 6. "ungated" is the ablation ``own_action_gate=False``.
+# run in which the learner and explicit loops over rows and atoms differed by less than
+# 1e-12. Actor values: updates 0, 2, 4, 6. "ungated" is ``own_action_gate=False``.
 RECORDED = {
     "gated": {
         "loss_actor": [
@@ -129,29 +130,64 @@ def _formula_noise(num_groups):
     return torch.stack(actor), torch.stack(target)
 
 
-def test_one_hand_in_loops_gives_the_published_trace():
-    """Anchors the loops: numbers of flashsac.md 14.2, from the published code."""
+def _noises(actor, target):
+    return {"actor_noise": actor, "target_noise": target}
+
+
+def _assert_runs_agree(loss, batches, noises, *, tolerance):
+    """Run both; same losses in every update, same state at the end.
+
+    Returns:
+        Per update the learner's ``loss_actor``, ``entropy``, ``loss_qvalue``, one value
+        a hand.
+    """
+    plain, stepper = PlainLearner(loss), FlashSACStepper(loss)
+    options = {"atol": tolerance, "rtol": 0}
+    trace = []
+    for td, pair in zip(batches, noises, strict=True):
+        report = stepper.update(td, **_noises(*pair))
+        wanted = plain.update(read_batch(td, loss), **_noises(*pair))
+        found = {
+            name: torch.stack(
+                [report[name if g is None else (g, name)] for g in loss.groups]
+            )
+            for name in ("loss_actor", "entropy", "alpha", "loss_qvalue")
+        }
+        for name, values in wanted.items():
+            torch.testing.assert_close(found[name], values, **options)
+        trace.append(found)
+    # every parameter and every running statistic, and the temperatures
+    found, wanted = PlainLearner(loss).state_dict(), plain.state_dict()
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        torch.testing.assert_close(found[name], value, **options)
+    return trace
+
+
+def test_the_plain_learner_of_one_hand_gives_the_published_trace():
+    """Anchors it: numbers of flashsac.md 14.2, from the published code."""
     loss = _formula_loss(None)
-    reference, batch = make_reference(loss), plain_batch(_formula_batch(None), loss)
-    reports = [reference.update(batch, *_formula_noise(1)) for _ in range(4)]
-    actor = [r["loss_actor"][0] for r in reports[::2]]
+    plain, batch = PlainLearner(loss), read_batch(_formula_batch(None), loss)
+    noise = _noises(*_formula_noise(1))
+    reports = [plain.update(batch, **noise) for _ in range(4)]
+    actor = [r["loss_actor"][0].item() for r in reports[::2]]
     assert actor == pytest.approx([0.131512656, 0.131074022], abs=1e-8)
     entropy = [r["entropy"][0].item() for r in reports[::2]]
     assert entropy == pytest.approx([-6.972654905, -6.888117895], abs=1e-8)
-    qvalue = [r["loss_qvalue"][0] for r in reports]
+    qvalue = [r["loss_qvalue"][0].item() for r in reports]
     wanted = [5.037813637, 5.016304959, 4.997505242, 4.982784655]
     assert qvalue == pytest.approx(wanted, abs=1e-8)
-    assert reference.log_alpha[0].item() == pytest.approx(-4.604570302, abs=1e-8)
+    assert plain.log_alpha[0].item() == pytest.approx(-4.604570302, abs=1e-8)
 
 
 @pytest.mark.parametrize("variant", RECORDED)
 def test_recorded_trace_of_two_hands(variant):
     loss = _formula_loss(SIDES, gate=variant == "gated")
     batches, noises = [_formula_batch(SIDES)] * 8, [_formula_noise(2)] * 8
-    trace = assert_runs_agree(loss, batches, noises, tolerance=1e-10)
+    trace = _assert_runs_agree(loss, batches, noises, tolerance=1e-10)
     for name, wanted in RECORDED[variant].items():
         rows = trace if name == "loss_qvalue" else trace[::2]
-        found = torch.tensor([row[name] for row in rows], dtype=torch.float64)
+        found = torch.stack([row[name] for row in rows])
         wanted = torch.tensor(wanted, dtype=torch.float64)
         torch.testing.assert_close(found, wanted, atol=2e-9, rtol=0)
 
@@ -179,7 +215,7 @@ def _random_loss(groups, *, future=False, head="unit", gate=True):
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_learner_equals_loops(make_batch, case):
+def test_learner_equals_the_plain_one(make_batch, case):
     """Random networks and a new batch every update."""
     torch.manual_seed(0)
     case = dict(case)
@@ -195,4 +231,4 @@ def test_learner_equals_loops(make_batch, case):
         batches.append(td)
         noises.append(torch.randn(2, len(groups), size, ACT, dtype=torch.float64))
     loss = _random_loss(groups, **case)
-    assert_runs_agree(loss, batches, noises, tolerance=1e-9)
+    _assert_runs_agree(loss, batches, noises, tolerance=1e-9)

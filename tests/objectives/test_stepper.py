@@ -7,9 +7,8 @@ import torch
 from torch._dynamo.utils import counters
 
 from flashdex.modules.layers import UnitBatchNorm, UnitLinear, UnitRMSNorm
-from flashdex.objectives.optim import cosine_rate
 from flashdex.objectives.reward_normalizer import RewardNormalizer
-from flashdex.objectives.stepper import FlashSACStepper
+from flashdex.objectives.stepper import FlashSACStepper, cosine_rate
 
 
 def _assert_projected(network):
@@ -52,7 +51,7 @@ def test_target_average_touches_parameters_only(make_loss, make_batch):
             wanted = old[name] + 0.1 * (online[name] - old[name])
             assert torch.allclose(value, wanted, atol=1e-6), name
     before = {k: v.clone() for k, v in target.state_dict().items() if "running" in k}
-    stepper.target_average.step()
+    stepper.average_target()
     for name, value in before.items():
         assert torch.equal(target.state_dict()[name], value), name
     stepper.update(make_batch(seed=1))

@@ -109,11 +109,7 @@ class RecordingFacts:
         return max(shares, default=0.0)
 
     def value(self, column: str) -> float | None:
-        """A figure as a number; None when it is not there or not finite.
-
-        Args:
-            column: of ``report.csv``.
-        """
+        """A column as a number; None when it is not there or not finite."""
         try:
             value = float(self.figures.get(column, ""))
         except ValueError:
@@ -126,9 +122,6 @@ def library_facts(library: MotionLibrary) -> list[RecordingFacts]:
 
     Rejected recordings are only in ``report.csv``; a motion that it does not name is
     taken from the manifest.
-
-    Args:
-        library: the prepared collection.
 
     Raises:
         LibraryError: ``report.csv`` is not a table.
@@ -152,21 +145,13 @@ def library_facts(library: MotionLibrary) -> list[RecordingFacts]:
 
 
 def facts_of_rows(rows: Iterable[Mapping[str, Any]]) -> list[RecordingFacts]:
-    """The same of rows that ``prepare`` has made, the worst first.
-
-    Args:
-        rows: columns of ``report.csv`` by name.
-    """
+    """The same of rows that ``prepare`` has made: columns of ``report.csv`` by name."""
     lines = [{k: str(v) for k, v in row.items() if v is not None} for row in rows]
     return worst_first([_make(line, {}, None, "") for line in lines])
 
 
 def worst_first(facts: Iterable[RecordingFacts]) -> list[RecordingFacts]:
-    """Rejected before flagged before kept; within each the worst figure first.
-
-    Args:
-        facts: recordings.
-    """
+    """Rejected before flagged before kept; within each the worst figure first."""
 
     def place(one: RecordingFacts) -> tuple[int, float]:
         known = one.status in STATUSES
@@ -176,21 +161,14 @@ def worst_first(facts: Iterable[RecordingFacts]) -> list[RecordingFacts]:
 
 
 def columns_of(facts: Sequence[RecordingFacts]) -> list[str]:
-    """Columns of ``report.csv`` besides motion, status and reason, in order.
-
-    Args:
-        facts: recordings; a rejected one may have fewer columns.
-    """
+    """Columns of ``report.csv`` besides motion, status and reason, in order."""
+    # a rejected recording may have fewer columns
     longest = sorted(facts, key=lambda one: -len(one.figures))
     return list(dict.fromkeys(column for one in longest for column in one.figures))
 
 
 def count_statuses(facts: Iterable[RecordingFacts]) -> dict[str, int]:
-    """Number of recordings of each status, every status named.
-
-    Args:
-        facts: recordings.
-    """
+    """Number of recordings of each status, every status named."""
     counts = Counter(one.status for one in facts)
     return {status: counts[status] for status in reversed(STATUSES)}
 
@@ -198,8 +176,7 @@ def count_statuses(facts: Iterable[RecordingFacts]) -> dict[str, int]:
 def count_codes(facts: Sequence[RecordingFacts]) -> dict[str, dict[str, int]]:
     """Recordings of each status by code, the most frequent code first.
 
-    Args:
-        facts: recordings; a code counts once in each.
+    A code counts once in each recording.
     """
     totals = Counter(code for one in facts for code in one.codes)
     return {
@@ -209,11 +186,7 @@ def count_codes(facts: Sequence[RecordingFacts]) -> dict[str, dict[str, int]]:
 
 
 def by_source(facts: Iterable[RecordingFacts]) -> dict[str, list[RecordingFacts]]:
-    """Recordings by source, the largest first.
-
-    Args:
-        facts: recordings.
-    """
+    """Recordings by source, the largest first."""
     groups: dict[str, list[RecordingFacts]] = {}
     for one in facts:
         groups.setdefault(one.source or "not recorded", []).append(one)
@@ -221,11 +194,7 @@ def by_source(facts: Iterable[RecordingFacts]) -> dict[str, list[RecordingFacts]
 
 
 def seconds_of(facts: Iterable[RecordingFacts]) -> float:
-    """Seconds of the motions that are not rejected.
-
-    Args:
-        facts: recordings.
-    """
+    """Seconds of the motions that are not rejected."""
     inside = (one for one in facts if one.status != "rejected")
     return sum(one.value("seconds") or 0.0 for one in inside)
 

@@ -47,6 +47,12 @@ class RunData:
         return str(self.recipe.get("train", {}).get("criterion", "sr_mt_obj"))
 
     @property
+    def ablation(self) -> str:
+        """Name of the ablation, empty without one."""
+        name = str(self.recipe.get("ablation") or "none")
+        return "" if name == "none" else name
+
+    @property
     def env_steps(self) -> int:
         """Env steps so far."""
         lines = [*self.metrics[-1:], *self.attempts[-1:]]
@@ -61,10 +67,7 @@ class RunData:
 
 
 def load_run(run_dir: str | Path) -> RunData:
-    """Read a run directory.
-
-    Args:
-        run_dir: folder with a ``recipe.yaml``.
+    """Read the folder that has a ``recipe.yaml``.
 
     Raises:
         RunError: this is no run directory, or a file in it is broken.
@@ -94,11 +97,7 @@ def load_run(run_dir: str | Path) -> RunData:
 
 
 def read_json(path: Path) -> Line:
-    """Read a JSON object; a file that does not exist is an empty one.
-
-    Args:
-        path: the file.
-    """
+    """Read a JSON object; a file that does not exist is an empty one."""
     if not path.is_file():
         return {}
     try:
@@ -114,7 +113,7 @@ def read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
     """Read JSON lines; a last line that a crash cut off is left out.
 
     Args:
-        path: the file; an absent one has no lines.
+        path: an absent file has no lines.
         needs: keys that every line has.
 
     Raises:
@@ -251,11 +250,7 @@ class MotionFacts:
 
 
 def motion_facts(run: RunData) -> list[MotionFacts]:
-    """Rows of all motions the files name, in the order of the collection.
-
-    Args:
-        run: the files.
-    """
+    """Rows of all motions the files name, in the order of the collection."""
     scored = (m for rows in run.baselines.values() for m in rows)
     names = dict.fromkeys([*scored, *(line["motion"] for line in run.attempts)])
     lines: dict[str, list[Line]] = {name: [] for name in names}
@@ -314,11 +309,7 @@ def _best(errors: Iterable[dict[str, float] | None]) -> dict[str, float]:
 
 
 def criterion_terms(criterion: str) -> tuple[Term, ...]:
-    """Signals and limits of a criterion; empty for one this version does not know.
-
-    Args:
-        criterion: its name.
-    """
+    """Signals and limits of a criterion; empty for one this version does not know."""
     try:
         name = resolve_criterion(criterion)
     except UnknownNameError:
@@ -327,12 +318,7 @@ def criterion_terms(criterion: str) -> tuple[Term, ...]:
 
 
 def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
-    """Motions of the collection; those without baseline and attempt are counted too.
-
-    Args:
-        run: the files.
-        facts: rows of the known motions.
-    """
+    """Motions of the collection; those without baseline and attempt are counted too."""
     for record in reversed(run.metrics):
         rate = record.get("convert/rate", 0.0)
         if rate > 0:
@@ -341,11 +327,7 @@ def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
 
 
 def count(facts: list[MotionFacts]) -> dict[str, int]:
-    """Converted motions, and how many of them are certified, robust, trivial.
-
-    Args:
-        facts: rows.
-    """
+    """Converted motions, and how many of them are certified, robust, trivial."""
     converted = [f for f in facts if f.is_converted]
     return {
         "converted": len(converted),
@@ -357,10 +339,5 @@ def count(facts: list[MotionFacts]) -> dict[str, int]:
 
 
 def in_unit(quantity: str, value: Any) -> float | None:
-    """Convert m or rad to the unit that is shown; None stays None.
-
-    Args:
-        quantity: a key of ``SHOWN``.
-        value: m or rad.
-    """
+    """Convert m or rad to the unit in which ``SHOWN`` has it; None stays None."""
     return None if value is None else float(value) * SHOWN[quantity][2]

@@ -3,36 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from flashdex.errors import RunError
-from flashdex.reports.page import (
-    Html,
-    duration,
-    facts,
-    inline,
-    joined,
-    number,
-    page,
-    tag,
-)
+from flashdex.reports.page import write_page
 from flashdex.reports.render.films import Film, draw_films
 from flashdex.reports.run.curves import conversion_charts, learning_charts
 from flashdex.reports.run.facts import (
+    PROVEN,
+    SHOWN,
+    Line,
     MotionFacts,
     RunData,
     count,
+    criterion_terms,
+    in_unit,
     load_run,
     motion_facts,
     num_motions,
 )
-from flashdex.reports.run.motion_table import motion_table, table_notes
-from flashdex.system.files import write_atomic
+from flashdex.reports.text import NOTHING, duration, number
 
 REPORT = "report.html"
-GHOST_NOTE = (
-    "Blue, translucent: where the recording has the object; it fades where both agree."
-)
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
+BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
+Cell = tuple[str, str]  # text, and "good" or "bad" where it is marked
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -53,47 +48,38 @@ def write_report(run_dir: str | Path) -> Path:
     """
     run = load_run(run_dir)
     rows = motion_facts(run)
+    total = num_motions(run, rows)
     stored = _stored_rollouts(run, rows)
     wanted = run.recipe.get("train", {}).get("render_conversions", True)
     fault = draw_films(list(stored.values())) if wanted else ""
-    name = str(run.recipe.get("name", run.path.name))
-    text = page(f"{name}: flashdex run", _sections(run, rows, stored, fault, name))
-    path = run.path / REPORT
-    try:
-        write_atomic(path, text)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror}).") from error
-    return path
-
-
-def _sections(
-    run: RunData,
-    rows: list[MotionFacts],
-    stored: dict[str, Path],
-    fault: str,
-    name: str,
-) -> list[Html]:
-    total = num_motions(run, rows)
-    conversions = conversion_charts(run, rows, total=total)
-    parts = [
-        tag("h1", name),
-        _header(run),
-        _numbers(rows, total),
-        _promises(run),
-        tag("h2", "Conversions"),
-        tag("div", *conversions, class_="charts large"),
-        tag("h2", "Motions"),
-        motion_table(run, rows, total=total),
-        table_notes(run),
+    films = [
+        (row, film)
+        for row in rows
+        if row.name in stored and (film := Film.of(stored[row.name])).video.is_file()
     ]
-    if any(row.is_converted for row in rows):
-        parts += [tag("h2", "Films"), _films(rows, stored, fault)]
-    for heading, charts in learning_charts(run):
-        parts += [tag("h2", heading), tag("div", *charts, class_="charts")]
-    return parts
+    return write_page(
+        run.path / REPORT,
+        "run.html",
+        error=RunError,
+        name=str(run.recipe.get("name", run.path.name)),
+        header=_header(run),
+        numbers=_numbers(rows, total),
+        promises=_promises(run),
+        conversions=conversion_charts(run, rows, total=total),
+        headings=_headings(run),
+        rows=[(row, _cells(run, row)) for row in rows],
+        total=total,
+        criterion=run.criterion,
+        baselines=run.baselines,
+        any_converted=any(row.is_converted for row in rows),
+        fault=fault,
+        films=films,
+        max_films=MAX_FILMS,
+        learning=learning_charts(run),
+    )
 
 
-def _header(run: RunData) -> Html:
+def _header(run: RunData) -> list[tuple[str, Any]]:
     recipe, versions = run.recipe, dict(run.versions)
     hardware = versions.pop("hardware", None)
     if isinstance(hardware, dict):
@@ -101,37 +87,32 @@ def _header(run: RunData) -> Html:
     steps = f"{run.env_steps:,}"
     if recipe.get("total_env_steps"):
         steps += f" of {recipe['total_env_steps']:,}"
-    ablation = recipe.get("ablation", "none")
-    return facts(
-        [
-            ("recipe", recipe.get("name")),
-            ("ablation", "" if ablation == "none" else ablation),
-            ("hand", recipe.get("hand")),
-            ("engine", recipe.get("physics", {}).get("engine")),
-            ("seed", recipe.get("seed")),
-            ("criterion", run.criterion),
-            ("env steps", steps),
-            ("wall time", duration(run.wall_s)),
-            ("hardware", hardware or "not recorded"),
-            ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),
-        ]
-    )
+    return [
+        ("recipe", recipe.get("name")),
+        ("ablation", run.ablation),
+        ("hand", recipe.get("hand")),
+        ("engine", recipe.get("physics", {}).get("engine")),
+        ("seed", recipe.get("seed")),
+        ("criterion", run.criterion),
+        ("env steps", steps),
+        ("wall time", duration(run.wall_s)),
+        ("hardware", hardware or "not recorded"),
+        ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),
+    ]
 
 
-def _numbers(rows: list[MotionFacts], total: int) -> Html:
+def _numbers(rows: list[MotionFacts], total: int) -> list[tuple[str, str]]:
     counts = count(rows)
-    cells = [
-        ("converted", f"{counts['converted']}/{total}"),
-        ("certified", f"{counts['certified']}/{counts['converted']}"),
-        ("robust", f"{counts['robust']}/{counts['converted']}"),
-        ("trivial", f"{counts['trivial']}/{counts['converted']}"),
+    converted = counts["converted"]
+    proven = ("certified", "robust", "trivial")
+    return [
+        ("converted", f"{converted}/{total}"),
+        *((name, f"{counts[name]}/{converted}") for name in proven),
         ("attempts", f"{counts['attempts']:,}"),
     ]
-    boxes = [tag("div", tag("b", value), name) for name, value in cells]
-    return tag("div", *boxes, class_="numbers")
 
 
-def _promises(run: RunData) -> Html:
+def _promises(run: RunData) -> list[str]:
     """What the recipe promised, beside the value at that many env steps."""
     lines = []
     for promise in run.recipe.get("expect") or []:
@@ -141,15 +122,12 @@ def _promises(run: RunData) -> Html:
         # A run that has converted everything has nothing more to reach.
         if records and records[-1].get("convert/rate") == 1.0:
             reached = reached or records[-1:]
-        bounds = [
+        bounds = " ".join(
             f"{k} {promise[k]:g}" for k in ("min", "max") if promise.get(k) is not None
-        ]
-        found = number(reached[0][key], 3) if reached else "not reached yet"
-        text = (
-            f"Promised: {key} {' '.join(bounds)} at {at:,} env steps. Found: {found}."
         )
-        lines.append(tag("p", text))
-    return joined(lines)
+        found = number(reached[0][key], 3) if reached else "not reached yet"
+        lines.append(f"Promised: {key} {bounds} at {at:,} env steps. Found: {found}.")
+    return lines
 
 
 def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
@@ -164,33 +142,74 @@ def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
     return found
 
 
-def _films(rows: list[MotionFacts], stored: dict[str, Path], fault: str) -> Html:
-    figures = [
-        _figure(row, Film.of(stored[row.name]))
-        for row in rows
-        if row.name in stored and Film.of(stored[row.name]).video.is_file()
+def _shown_limits(criterion: str) -> dict[str, float | None]:
+    """Errors worth a column, with limits: the object's, and what the criterion has."""
+    limits = {term.quantity: term.limit for term in criterion_terms(criterion)}
+    base = [] if "object_pos_centred" in limits else ["object_pos"]
+    shown = dict.fromkeys([*base, *limits, "object_rot"])
+    return {q: limits.get(q) for q in shown if q in SHOWN}
+
+
+def _headings(run: RunData) -> list[str]:
+    errors = []
+    for quantity, limit in _shown_limits(run.criterion).items():
+        name, unit, _ = SHOWN[quantity]
+        shown = in_unit(quantity, limit)
+        errors.append(
+            f"{name} {unit}" + ("" if shown is None else f" (≤\u00a0{shown:g})")
+        )
+    return [
+        *("motion", "hands", "attempts", "env steps", "minutes"),
+        *errors,
+        *("certificate", "robust share", "penetration mm", "force N"),
+        *(f"{BASELINE_WORDS.get(b, b)}, mm / deg" for b in run.baselines),
+        "failures",
     ]
-    notes = [tag("p", f"{fault}.", class_="bad")] if fault else []
-    note = GHOST_NOTE if figures else "No films of this run."
-    notes.append(tag("p", note, class_="soft"))
-    if len(figures) > MAX_FILMS:
-        rest = len(figures) - MAX_FILMS
-        notes.append(tag("p", f"{rest} more films lie in the folder films/."))
-    grid = tag("div", *figures[:MAX_FILMS], class_="films")
-    return joined([*notes, grid])
 
 
-def _figure(row: MotionFacts, film: Film) -> Html:
-    video = tag(
-        "video",
-        src=inline(film.video),
-        poster=inline(film.poster),
-        controls="controls",
-        loop="loop",
-        muted="muted",
-        playsinline="playsinline",
-        preload="none",
-    )
-    stills = Html(f'<img src="{inline(film.stills)}" alt="stills">')
-    caption = tag("figcaption", f"{row.name}: {row.verdict}")
-    return tag("figure", video, stills, caption)
+def _cells(run: RunData, row: MotionFacts) -> list[Cell]:
+    """A row of the table of motions, without the name."""
+    first, limits = row.first or {}, _shown_limits(run.criterion)
+    share = row.robust_share
+    texts = [
+        "both" if len(row.hands) == 2 else "".join(row.hands) or NOTHING,
+        f"{row.attempts:,}",
+        f"{first['env_steps']:,}" if first else NOTHING,
+        number(first["wall_s"] / 60) if first else NOTHING,
+    ]
+    proof = [
+        NOTHING if share is None else f"{share:.0%}",
+        number(row.penetration_mm),
+        number(row.force),
+        *(_baseline(row.baselines.get(b), run.criterion) for b in run.baselines),
+        row.failures or NOTHING,
+    ]
+    return [
+        *((text, "") for text in texts),
+        *(_error(row.errors.get(q), q, limit) for q, limit in limits.items()),
+        _verdict(row),
+        *((text, "") for text in proof),
+    ]
+
+
+def _error(value: float | None, quantity: str, limit: float | None) -> Cell:
+    is_beyond = value is not None and limit is not None and value > limit
+    return number(in_unit(quantity, value)), "bad" if is_beyond else ""
+
+
+def _verdict(row: MotionFacts) -> Cell:
+    if not row.is_converted:
+        return NOTHING, ""
+    reason = row.certificate.get("reason", "")
+    words = row.verdict.replace("_", " ") + (f" ({reason})" if reason else "")
+    return words, "good" if row.verdict in PROVEN else "bad"
+
+
+def _baseline(score: Line | None, criterion: str) -> str:
+    if score is None:
+        return NOTHING
+    errors = score.get("errors", {})
+    place = errors.get("object_pos_centred", errors.get("object_pos"))
+    passes = " passes" if criterion in score.get("passed", []) else ""
+    shown = {"object_pos": place, "object_rot": errors.get("object_rot")}
+    return " / ".join(number(in_unit(q, e), 0) for q, e in shown.items()) + passes

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.recipe import task_of_run
-from flashdex.reports.page import duration, number
 from flashdex.reports.run.facts import (
     SHOWN,
     MotionFacts,
@@ -22,8 +20,8 @@ from flashdex.reports.run.facts import (
     num_motions,
 )
 from flashdex.reports.run.report import write_report
+from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shorten
 
-MAX_WIDTH = 100
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
 HEADINGS = ("motion", "hand", "tries", "steps", "min", "mm", "deg")
@@ -32,11 +30,7 @@ STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
 
 
 def run_table(run_dir: str | Path) -> str:
-    """The facts of ``report.html`` for a terminal.
-
-    Args:
-        run_dir: run directory.
-    """
+    """The facts of ``report.html`` for a terminal."""
     run = load_run(run_dir)
     rows = motion_facts(run)
     names = list(run.baselines)[: len(BASELINES)]
@@ -49,15 +43,13 @@ def run_table(run_dir: str | Path) -> str:
 
 def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     counts, recipe = count(rows), run.recipe
-    converted = counts["converted"]
-    ablation = recipe.get("ablation", "none")
-    shown = "" if ablation == "none" else f"  ablation {ablation}"
+    shown = f"  ablation {run.ablation}" if run.ablation else ""
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  "
         f"seed {recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
         f"{duration(run.wall_s)}",
-        f"{converted}/{num_motions(run, rows)} converted by {run.criterion}, "
+        f"{counts['converted']}/{num_motions(run, rows)} converted by {run.criterion}, "
         f"{counts['certified']} certified ({counts['robust']} robust), "
         f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
     ]
@@ -82,19 +74,14 @@ def _cells(row: MotionFacts, baselines: list[str]) -> list[str]:
     ]
 
 
-def _error(errors: Mapping[str, float], quantity: str) -> str:
-    centred = f"{quantity}_centred"
-    value = errors.get(quantity, errors.get(centred))
-    return plain(in_unit(quantity, value))
+def _error(errors: Mapping[str, float], quantity: str, *, digits: int = 1) -> str:
+    value = errors.get(quantity, errors.get(f"{quantity}_centred"))
+    return plain(in_unit(quantity, value), digits)
 
 
 def _baseline(score: Mapping[str, Any] | None) -> str:
     errors = (score or {}).get("errors", {})
-    pair = [
-        plain(in_unit(q, errors.get(q, errors.get(f"{q}_centred"))), 0)
-        for q in ("object_pos", "object_rot")
-    ]
-    return "/".join(pair)
+    return "/".join(_error(errors, q, digits=0) for q in ("object_pos", "object_rot"))
 
 
 def _failures(rows: list[MotionFacts]) -> list[str]:
@@ -185,78 +172,17 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
 
 
 def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> str:
-    """One replayed rollout.
-
-    Args:
-        motion: its name.
-        stored: verdict in the run's files.
-        found: verdict of the replay.
-        holds: the conversion is proven and the files say so.
-    """
+    """One replayed rollout: its verdict in the run's files, and of the replay."""
     word = "holds" if holds else "DOES NOT HOLD"
     name = shorten(motion, 40)
     return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
-
-
-def align(cells: Sequence[Sequence[str]], *, left: Sequence[int] = (0,)) -> list[str]:
-    """Lay rows out in columns.
-
-    Args:
-        cells: rows of equal length.
-        left: columns aligned to the left; the others are numbers.
-    """
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        " ".join(
-            f"{cell:<{width}}" if index in left else f"{cell:>{width}}"
-            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
-
-
-def plain(value: float | None, digits: int = 1) -> str:
-    """A number without separators, or ``-``.
-
-    Args:
-        value: number or None.
-        digits: behind the point.
-    """
-    missing = value is None or not math.isfinite(value)
-    return "-" if missing else number(value, digits).replace(",", "")
-
-
-def short(value: float) -> str:
-    """Three digits and a letter: ``12.3M``.
-
-    Args:
-        value: a count.
-    """
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g}{letter}"
-    return f"{value:.0f}"
-
-
-def shorten(text: str, width: int) -> str:
-    """Cut a long text, marked by dots.
-
-    Args:
-        text: any.
-        width: characters it may have.
-    """
-    return text if len(text) <= width else f"{text[: width - 2]}.."
 
 
 ROWS = 12  # newest evaluations shown
 
 
 def gym_run_table(run_dir: str | Path) -> str:
-    """Return of the deterministic policy over env steps, newest last.
-
-    Args:
-        run_dir: run directory.
-    """
+    """Return of the deterministic policy over env steps, newest last."""
     run = load_run(run_dir)
     env_id = run.recipe.get("gym", {}).get("env_id", "?")
     head = (
@@ -277,11 +203,7 @@ def gym_run_table(run_dir: str | Path) -> str:
 
 
 def run_summary(run_dir: Path) -> str:
-    """Table of a run; of one with motions, the report is written as well.
-
-    Args:
-        run_dir: run directory.
-    """
+    """Table of a run; of one with motions, the report is written as well."""
     if task_of_run(run_dir) == "gym":
         return gym_run_table(run_dir)
     return f"{run_table(run_dir)}\n\nreport: {write_report(run_dir)}"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -173,40 +173,65 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class MotionFacts:
-    """One row of the per-motion table.
+    """One row of the per-motion table: what the files of a run say about a motion.
 
     Args:
+        run: the files.
         name: motion id.
-        hands: hands that take part, as far as the files tell.
-        attempts: scored rollouts from frame 0.
-        failed: attempts that did not pass.
-        first: ledger line of the first conversion, or None.
-        errors: of the first conversion, else of the best complete attempt; m and rad.
-        completed: attempts that reached the end of the motion.
-        furthest: last frame that any attempt reached, -1 without attempts.
-        causes: (cause, hand) of failed attempts with their numbers, most first.
-        baselines: baseline -> its score of this motion.
-        trivial: baselines that pass already.
-        certificate: of the stored rollout, or empty.
+        lines: of the ledger, scored rollouts from frame 0, oldest first.
     """
 
+    run: RunData
     name: str
-    hands: tuple[str, ...]
-    attempts: int
-    failed: int
-    first: Line | None
-    errors: dict[str, float]
-    completed: int
-    furthest: int
-    causes: list[tuple[tuple[str, str], int]]
-    baselines: dict[str, Line]
-    trivial: tuple[str, ...]
-    certificate: Line = field(default_factory=dict)
+    lines: list[Line]
+
+    @cached_property
+    def baselines(self) -> dict[str, Line]:
+        """Score of this motion by baseline."""
+        scores = self.run.baselines.items()
+        return {b: rows[self.name] for b, rows in scores if self.name in rows}
+
+    @cached_property
+    def first(self) -> Line | None:
+        """Ledger line of the first conversion."""
+        return next((line for line in self.lines if line.get("converted")), None)
 
     @property
     def is_converted(self) -> bool:
         """At least one attempt passed."""
         return self.first is not None
+
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Of the first conversion, else of the best complete attempt; m and rad."""
+        if self.first:
+            return self.first["errors"]
+        found = [line["errors"] for line in self.lines if line.get("errors")]
+        return min(found, key=_error_size, default={})
+
+    @property
+    def hands(self) -> tuple[str, ...]:
+        """Hands that a criterion or a cause names: an absent hand has neither."""
+        found: set[str] = set()
+        for line in [*self.lines, *self.baselines.values()]:
+            found.update(line.get("hands", []))
+            found.update(hand for _, hand in _why(line))
+            found.update(name.rpartition("_")[2] for name in line.get("passed", []))
+        return tuple(side for side in SIDES if side in found)
+
+    @property
+    def trivial(self) -> list[str]:
+        """Baselines without learning that pass already."""
+        scores = self.baselines.items()
+        criterion = self.run.criterion
+        passing = [b for b, row in scores if criterion in row.get("passed", [])]
+        named = [b for line in self.lines for b in line.get("trivial") or []]
+        return list(dict.fromkeys([*passing, *named]))
+
+    @property
+    def certificate(self) -> Line:
+        """Of the stored rollout, which counts only where the ledger claims it."""
+        return self.run.certificates.get(self.name, {}) if self.first else {}
 
     @property
     def verdict(self) -> str:
@@ -233,20 +258,23 @@ class MotionFacts:
         return self.certificate.get("safety", {}).get("force_peak")
 
     @property
-    def why(self) -> str:
-        """Most frequent cause of failure with its share of the failed attempts."""
-        if not self.causes:
-            return "" if self.attempts else "not attempted"
-        (cause, hand), count = self.causes[0]
-        share = f"{count / self.failed:.0%}"
-        return " ".join(word for word in (cause, hand, share) if word)
-
-    @property
     def failures(self) -> str:
-        """:attr:`why`, and how far the motion came if no attempt reached its end."""
-        if self.is_converted or self.completed or not self.attempts:
-            return self.why
-        return f"{self.why}; never completed, furthest frame {self.furthest}"
+        """Most frequent cause of failure with its share of the failed attempts.
+
+        And how far the motion came, if no attempt reached its end.
+        """
+        if not self.lines:
+            return "not attempted"
+        failed = [line for line in self.lines if not line.get("converted")]
+        causes = Counter(cause for line in failed for cause in _why(line))
+        why = ""
+        for (cause, hand), times in causes.most_common(1):
+            share = f"{times / len(failed):.0%}"
+            why = " ".join(word for word in (cause, hand, share) if word)
+        if self.is_converted or any(line.get("completed") for line in self.lines):
+            return why
+        furthest = max(line.get("frame", -1) for line in self.lines)
+        return f"{why}; never completed, furthest frame {furthest}"
 
 
 def motion_facts(run: RunData) -> list[MotionFacts]:
@@ -256,30 +284,7 @@ def motion_facts(run: RunData) -> list[MotionFacts]:
     lines: dict[str, list[Line]] = {name: [] for name in names}
     for line in run.attempts:
         lines[line["motion"]].append(line)
-    return [_facts(run, name, lines[name]) for name in names]
-
-
-def _facts(run: RunData, name: str, lines: list[Line]) -> MotionFacts:
-    first = next((line for line in lines if line.get("converted")), None)
-    scores = {b: rows[name] for b, rows in run.baselines.items() if name in rows}
-    passing = [b for b, row in scores.items() if run.criterion in row.get("passed", [])]
-    named = [b for line in lines for b in line.get("trivial") or []]
-    failed = [line for line in lines if not line.get("converted")]
-    causes = Counter(cause for line in failed for cause in _why(line))
-    return MotionFacts(
-        name=name,
-        hands=_hands([*lines, *scores.values()]),
-        attempts=len(lines),
-        failed=len(failed),
-        first=first,
-        errors=first["errors"] if first else _best([li.get("errors") for li in lines]),
-        completed=sum(bool(line.get("completed")) for line in lines),
-        furthest=max((line.get("frame", -1) for line in lines), default=-1),
-        causes=causes.most_common(),
-        baselines=scores,
-        trivial=tuple(dict.fromkeys([*passing, *named])),
-        certificate=run.certificates.get(name, {}) if first else {},
-    )
+    return [MotionFacts(run, name, found) for name, found in lines.items()]
 
 
 def _why(line: Line) -> set[tuple[str, str]]:
@@ -289,23 +294,9 @@ def _why(line: Line) -> set[tuple[str, str]]:
     }
 
 
-def _hands(lines: Iterable[Line]) -> tuple[str, ...]:
-    """Hands that a per-hand criterion or a cause names: an absent hand has neither."""
-    found: set[str] = set()
-    for line in lines:
-        found.update(line.get("hands", []))
-        found.update(hand for _, hand in _why(line))
-        found.update(name.rpartition("_")[2] for name in line.get("passed", []))
-    return tuple(side for side in SIDES if side in found)
-
-
-def _best(errors: Iterable[dict[str, float] | None]) -> dict[str, float]:
-    """Smallest object error: 30 degrees weigh as much as 3 cm, as in the ledger."""
-
-    def size(one: dict[str, float]) -> float:
-        return one.get("object_pos", 9.0) + 0.0573 * one.get("object_rot", 9.0)
-
-    return min((e for e in errors if e), key=size, default={})
+def _error_size(errors: dict[str, float]) -> float:
+    """Object error: 30 degrees weigh as much as 3 cm, as in the ledger."""
+    return errors.get("object_pos", 9.0) + 0.0573 * errors.get("object_rot", 9.0)
 
 
 def criterion_terms(criterion: str) -> tuple[Term, ...]:
@@ -334,7 +325,7 @@ def count(facts: list[MotionFacts]) -> dict[str, int]:
         "certified": sum(f.verdict in PROVEN for f in converted),
         "robust": sum(f.verdict == "robust" for f in converted),
         "trivial": sum(bool(f.trivial) for f in converted),
-        "attempts": sum(f.attempts for f in facts),
+        "attempts": sum(len(f.lines) for f in facts),
     }
 
 

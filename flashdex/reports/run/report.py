@@ -173,7 +173,7 @@ def _cells(run: RunData, row: MotionFacts) -> list[Cell]:
     share = row.robust_share
     texts = [
         "both" if len(row.hands) == 2 else "".join(row.hands) or NOTHING,
-        f"{row.attempts:,}",
+        f"{len(row.lines):,}",
         f"{first['env_steps']:,}" if first else NOTHING,
         number(first["wall_s"] / 60) if first else NOTHING,
     ]

@@ -61,7 +61,7 @@ def _cells(row: MotionFacts, baselines: list[str]) -> list[str]:
     return [
         shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
         "+".join(side[0].upper() for side in row.hands) or "-",
-        str(row.attempts),
+        str(len(row.lines)),
         short(first["env_steps"]) if first else "-",
         plain(first["wall_s"] / 60) if first else "-",
         _error(row.errors, "object_pos"),

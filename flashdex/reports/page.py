@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from flashdex.errors import FlashdexError
-from flashdex.reports.text import number, shorten
+from flashdex.reports.text import duration, number, shorten
 from flashdex.system.files import write_atomic
 
 
@@ -58,6 +58,7 @@ _ENVIRONMENT = Environment(
 )
 _ENVIRONMENT.filters |= {
     "breakable": _breakable,
+    "duration": duration,
     "inline": _inline,
     "number": number,
     "px": "{:.1f}".format,

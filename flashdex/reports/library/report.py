@@ -67,9 +67,10 @@ def write_library_report(
         "library.html",
         error=LibraryError,
         name=library.path.resolve().name,
-        header=_header(library),
-        numbers=_numbers(library, recordings),
-        statuses=COUNTED,
+        library=library,
+        versions=library.manifest.get("versions") or {},
+        motion_s=len(library.frames) / library.fps,
+        counts=count_statuses(recordings),
         sources=_sources(recordings),
         codes=count_codes(recordings),
         meanings=CODES,
@@ -79,35 +80,8 @@ def write_library_report(
         max_reason=MAX_REASON,
         carded=set(rows),
         cards=[_card(library, row, inside[row], stills.get(row)) for row in rows],
-        num_motions=library.num_motions,
-        has_quality=library.quality is not None,
         fault=fault,
     )
-
-
-def _header(library: MotionLibrary) -> list[tuple[str, str]]:
-    versions = dict(library.manifest.get("versions") or {})
-    return [
-        ("hand", library.hand),
-        ("rate", f"{library.fps:g} Hz"),
-        ("motions", f"{library.num_motions:,}"),
-        ("frames", f"{len(library.frames):,}"),
-        ("objects", f"{len(library.objects):,}"),
-        ("motion", duration(len(library.frames) / library.fps)),
-        ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),
-    ]
-
-
-def _numbers(
-    library: MotionLibrary, recordings: Sequence[RecordingFacts]
-) -> list[tuple[str, str]]:
-    total = len(recordings)
-    counts = count_statuses(recordings).items()
-    seconds = len(library.frames) / library.fps
-    return [
-        *((status, f"{count:,}/{total:,}") for status, count in counts),
-        ("seconds of motion", f"{seconds:,.0f}"),
-    ]
 
 
 def _sources(recordings: Sequence[RecordingFacts]) -> list[list[Any]]:

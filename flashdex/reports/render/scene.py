@@ -76,13 +76,7 @@ def fit_view(
 
 
 def dress_scene(spec: mujoco.MjSpec, *, width: int, height: int) -> mujoco.MjSpec:
-    """Add the light and the pale sky of all pictures to a scene.
-
-    Args:
-        spec: scene under construction; it is returned.
-        width: of the largest picture, pixels.
-        height: likewise.
-    """
+    """Add light and a pale sky to a scene, for pictures of that many pixels."""
     spec.add_texture(
         name="film_sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

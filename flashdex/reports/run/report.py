@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from flashdex.errors import RunError
 from flashdex.reports.page import write_page
@@ -12,7 +11,6 @@ from flashdex.reports.run.curves import conversion_charts, learning_charts
 from flashdex.reports.run.facts import (
     PROVEN,
     SHOWN,
-    Line,
     MotionFacts,
     RunData,
     count,
@@ -22,7 +20,7 @@ from flashdex.reports.run.facts import (
     motion_facts,
     num_motions,
 )
-from flashdex.reports.text import NOTHING, duration, number
+from flashdex.reports.text import NOTHING, number
 
 REPORT = "report.html"
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
@@ -62,16 +60,13 @@ def write_report(run_dir: str | Path) -> Path:
         "run.html",
         error=RunError,
         name=str(run.recipe.get("name", run.path.name)),
-        header=_header(run),
-        numbers=_numbers(rows, total),
+        run=run,
+        hardware=_hardware(run),
+        counts=count(rows),
         promises=_promises(run),
         conversions=conversion_charts(run, rows, total=total),
-        headings=_headings(run),
         rows=[(row, _cells(run, row)) for row in rows],
         total=total,
-        criterion=run.criterion,
-        baselines=run.baselines,
-        any_converted=any(row.is_converted for row in rows),
         fault=fault,
         films=films,
         max_films=MAX_FILMS,
@@ -79,37 +74,11 @@ def write_report(run_dir: str | Path) -> Path:
     )
 
 
-def _header(run: RunData) -> list[tuple[str, Any]]:
-    recipe, versions = run.recipe, dict(run.versions)
-    hardware = versions.pop("hardware", None)
-    if isinstance(hardware, dict):
-        hardware = ", ".join(f"{k} {v}" for k, v in hardware.items())
-    steps = f"{run.env_steps:,}"
-    if recipe.get("total_env_steps"):
-        steps += f" of {recipe['total_env_steps']:,}"
-    return [
-        ("recipe", recipe.get("name")),
-        ("ablation", run.ablation),
-        ("hand", recipe.get("hand")),
-        ("engine", recipe.get("physics", {}).get("engine")),
-        ("seed", recipe.get("seed")),
-        ("criterion", run.criterion),
-        ("env steps", steps),
-        ("wall time", duration(run.wall_s)),
-        ("hardware", hardware or "not recorded"),
-        ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),
-    ]
-
-
-def _numbers(rows: list[MotionFacts], total: int) -> list[tuple[str, str]]:
-    counts = count(rows)
-    converted = counts["converted"]
-    proven = ("certified", "robust", "trivial")
-    return [
-        ("converted", f"{converted}/{total}"),
-        *((name, f"{counts[name]}/{converted}") for name in proven),
-        ("attempts", f"{counts['attempts']:,}"),
-    ]
+def _hardware(run: RunData) -> str:
+    found = run.versions.get("hardware")
+    if isinstance(found, dict):
+        return ", ".join(f"{k} {v}" for k, v in found.items())
+    return str(found or "not recorded")
 
 
 def _promises(run: RunData) -> list[str]:
@@ -150,51 +119,37 @@ def _shown_limits(criterion: str) -> dict[str, float | None]:
     return {q: limits.get(q) for q in shown if q in SHOWN}
 
 
-def _headings(run: RunData) -> list[str]:
-    errors = []
-    for quantity, limit in _shown_limits(run.criterion).items():
-        name, unit, _ = SHOWN[quantity]
-        shown = in_unit(quantity, limit)
-        errors.append(
-            f"{name} {unit}" + ("" if shown is None else f" (≤\u00a0{shown:g})")
-        )
-    return [
-        *("motion", "hands", "attempts", "env steps", "minutes"),
-        *errors,
-        *("certificate", "robust share", "penetration mm", "force N"),
-        *(f"{BASELINE_WORDS.get(b, b)}, mm / deg" for b in run.baselines),
-        "failures",
+def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
+    """A row of the table of motions by heading, without the name."""
+    first, share = row.first, row.robust_share
+    errors = [
+        _error(row, q, limit) for q, limit in _shown_limits(run.criterion).items()
     ]
+    baselines = {
+        f"{BASELINE_WORDS.get(b, b)}, mm / deg": (_baseline(row, b), "")
+        for b in run.baselines
+    }
+    return {
+        "hands": ("both" if len(row.hands) == 2 else "".join(row.hands) or NOTHING, ""),
+        "attempts": (f"{len(row.lines):,}", ""),
+        "env steps": (f"{first['env_steps']:,}" if first else NOTHING, ""),
+        "minutes": (number(first["wall_s"] / 60) if first else NOTHING, ""),
+        **dict(errors),
+        "certificate": _verdict(row),
+        "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
+        "penetration mm": (number(row.penetration_mm), ""),
+        "force N": (number(row.force), ""),
+        **baselines,
+        "failures": (row.failures or NOTHING, ""),
+    }
 
 
-def _cells(run: RunData, row: MotionFacts) -> list[Cell]:
-    """A row of the table of motions, without the name."""
-    first, limits = row.first or {}, _shown_limits(run.criterion)
-    share = row.robust_share
-    texts = [
-        "both" if len(row.hands) == 2 else "".join(row.hands) or NOTHING,
-        f"{len(row.lines):,}",
-        f"{first['env_steps']:,}" if first else NOTHING,
-        number(first["wall_s"] / 60) if first else NOTHING,
-    ]
-    proof = [
-        NOTHING if share is None else f"{share:.0%}",
-        number(row.penetration_mm),
-        number(row.force),
-        *(_baseline(row.baselines.get(b), run.criterion) for b in run.baselines),
-        row.failures or NOTHING,
-    ]
-    return [
-        *((text, "") for text in texts),
-        *(_error(row.errors.get(q), q, limit) for q, limit in limits.items()),
-        _verdict(row),
-        *((text, "") for text in proof),
-    ]
-
-
-def _error(value: float | None, quantity: str, limit: float | None) -> Cell:
+def _error(row: MotionFacts, quantity: str, limit: float | None) -> tuple[str, Cell]:
+    (name, unit, _), value = SHOWN[quantity], row.errors.get(quantity)
+    bound = "" if limit is None else f" (≤\u00a0{in_unit(quantity, limit):g})"
     is_beyond = value is not None and limit is not None and value > limit
-    return number(in_unit(quantity, value)), "bad" if is_beyond else ""
+    cell = number(in_unit(quantity, value)), "bad" if is_beyond else ""
+    return f"{name} {unit}{bound}", cell
 
 
 def _verdict(row: MotionFacts) -> Cell:
@@ -205,11 +160,12 @@ def _verdict(row: MotionFacts) -> Cell:
     return words, "good" if row.verdict in PROVEN else "bad"
 
 
-def _baseline(score: Line | None, criterion: str) -> str:
-    if score is None:
+def _baseline(row: MotionFacts, name: str) -> str:
+    if name not in row.baselines:
         return NOTHING
-    errors = score.get("errors", {})
+    errors = row.baselines[name].get("errors", {})
     place = errors.get("object_pos_centred", errors.get("object_pos"))
-    passes = " passes" if criterion in score.get("passed", []) else ""
     shown = {"object_pos": place, "object_rot": errors.get("object_rot")}
-    return " / ".join(number(in_unit(q, e), 0) for q, e in shown.items()) + passes
+    words = " / ".join(number(in_unit(q, e), 0) for q, e in shown.items())
+    passes = row.run.criterion in row.baselines[name].get("passed", [])
+    return words + (" passes" if passes else "")

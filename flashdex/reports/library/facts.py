@@ -77,7 +77,7 @@ class RecordingFacts:
 
     Args:
         name: of the motion.
-        status: kept, flagged or rejected.
+        status: one of ``STATUSES``.
         reason: codes with their text.
         figures: every other column, as written.
         row: of the library, None when it is not in it.
@@ -126,21 +126,21 @@ def library_facts(library: MotionLibrary) -> list[RecordingFacts]:
     Raises:
         LibraryError: ``report.csv`` is not a table.
     """
-    written = _read_report(library.path / "report.csv")
-    motions = {m["name"]: m for m in library.manifest["motions"]}
-    rows = {name: row for row, name in enumerate(library.names)}
+    # a library of several sources has a list here, which says nothing about one motion
+    source = library.manifest.get("source", "")
+    source = source if isinstance(source, str) else ""
+    motions = {m["name"]: (row, m) for row, m in enumerate(library.manifest["motions"])}
     facts = []
-    for line in written:
-        name = line.get("motion", "")
-        inside = line.get("status") != "rejected" and name in rows
-        row = rows.pop(name, None) if inside else None
-        info = motions[name] if row is not None else {}
-        facts.append(_make(line, info, row, _source_of(library)))
-    for name, row in rows.items():
-        seconds = int(library.motions["length"][row]) / library.fps
-        line = {"motion": name, "status": "kept", **_texts(motions[name])}
-        line["seconds"] = f"{seconds:.3f}"
-        facts.append(_make(line, motions[name], row, _source_of(library)))
+    for line in _read_report(library.path / "report.csv"):
+        row, info = None, {}
+        if line.get("status") != "rejected":
+            row, info = motions.pop(line.get("motion", ""), (row, info))
+        facts.append(_make(line, info, row, source))
+    for name, (row, info) in motions.items():
+        line = {"motion": name, "status": "kept"}
+        line |= {k: str(info[k]) for k in ("status", "reason") if k in info}
+        line["seconds"] = f"{int(library.motions['length'][row]) / library.fps:.3f}"
+        facts.append(_make(line, info, row, source))
     return worst_first(facts)
 
 
@@ -212,17 +212,6 @@ def _make(
         source=str(line.get("source") or info.get("source") or source),
         licence=str(info.get("licence") or line.get("licence") or ""),
     )
-
-
-def _texts(info: Mapping[str, Any]) -> dict[str, str]:
-    """What the manifest says about status and reason of a motion."""
-    return {k: str(info[k]) for k in ("status", "reason") if k in info}
-
-
-def _source_of(library: MotionLibrary) -> str:
-    # a library of several sources has a list here, which says nothing about one motion
-    source = library.manifest.get("source", "")
-    return source if isinstance(source, str) else ""
 
 
 def _read_report(path: Path) -> list[dict[str, str]]:

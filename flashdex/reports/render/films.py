@@ -23,13 +23,7 @@ _PROBE = (
 
 @dataclass(frozen=True)
 class Film:
-    """Files of one drawn rollout.
-
-    Args:
-        video: mp4.
-        stills: pictures side by side, png.
-        poster: first picture, png.
-    """
+    """Files of one drawn rollout: mp4; as png, pictures side by side and the first."""
 
     video: Path
     stills: Path

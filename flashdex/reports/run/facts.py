@@ -86,18 +86,18 @@ def load_run(run_dir: str | Path) -> RunData:
     return RunData(
         path=path,
         recipe=composed if isinstance(composed, dict) else {},
-        versions=read_json(path / "versions.json"),
+        versions=_read_json(path / "versions.json"),
         metrics=_drop_repeated(
-            read_lines(path / "metrics.jsonl", needs=("env_steps",))
+            _read_lines(path / "metrics.jsonl", needs=("env_steps",))
         ),
-        attempts=read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
-        baselines=read_json(path / "baselines.json"),
+        attempts=_read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
+        baselines=_read_json(path / "baselines.json"),
         certificates=_certificates(path / "rollouts"),
     )
 
 
-def read_json(path: Path) -> Line:
-    """Read a JSON object; a file that does not exist is an empty one."""
+def _read_json(path: Path) -> Line:
+    """A JSON object; a file that does not exist is an empty one."""
     if not path.is_file():
         return {}
     try:
@@ -109,34 +109,22 @@ def read_json(path: Path) -> Line:
     return found
 
 
-def read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
-    """Read JSON lines; a last line that a crash cut off is left out.
-
-    Args:
-        path: an absent file has no lines.
-        needs: keys that every line has.
-
-    Raises:
-        RunError: a line before the last is broken, or lacks a key.
-    """
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
+def _read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
+    """JSON lines with these keys; a last line that a crash cut off is left out."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     found = []
     for number, text in enumerate(lines, start=1):
+        where = f"{path}: line {number}"
         try:
             line = json.loads(text)
         except ValueError as error:
             if number == len(lines):
                 break
-            raise RunError(
-                f"{path}: line {number} is not JSON ({error}). Remove the line."
-            ) from error
+            fault = f"{where} is not JSON ({error}). Remove the line."
+            raise RunError(fault) from error
         absent = [key for key in needs if not isinstance(line, dict) or key not in line]
         if absent:
-            raise RunError(
-                f"{path}: line {number} lacks {', '.join(absent)}. Remove the line."
-            )
+            raise RunError(f"{where} lacks {', '.join(absent)}. Remove the line.")
         found.append(line)
     return found
 
@@ -153,7 +141,7 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
 def _certificates(folder: Path) -> dict[str, Line]:
     found = {}
     for path in sorted(folder.glob("*.certificate.json")):
-        certificate = read_json(path)
+        certificate = _read_json(path)
         name = certificate.get("identity", {}).get("motion")
         found[name or path.name.removesuffix(".certificate.json")] = certificate
     return found
@@ -242,20 +230,13 @@ class MotionFacts:
         return str(found or "none")
 
     @property
-    def robust_share(self) -> float | None:
-        """Share of perturbed replays that passed."""
+    def proof(self) -> tuple[float | None, float | None, float | None]:
+        """Share of perturbed replays that passed; nominal: depth, mm, and force, N."""
         name = self.certificate.get("identity", {}).get("criterion")
-        return self.certificate.get("perturbed", {}).get("pass_fraction", {}).get(name)
-
-    @property
-    def penetration_mm(self) -> float | None:
-        """Largest penetration of the replay."""
-        return self.certificate.get("safety", {}).get("penetration_max_mm")
-
-    @property
-    def force(self) -> float | None:
-        """Largest normal force of the replay, N."""
-        return self.certificate.get("safety", {}).get("force_peak")
+        shares = self.certificate.get("perturbed", {}).get("pass_fraction", {})
+        safety = self.certificate.get("safety", {})
+        peaks = (safety.get(key) for key in ("penetration_max_mm", "force_peak"))
+        return shares.get(name), *peaks
 
     @property
     def failures(self) -> str:

@@ -121,10 +121,9 @@ def _shown_limits(criterion: str) -> dict[str, float | None]:
 
 def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
     """A row of the table of motions by heading, without the name."""
-    first, share = row.first, row.robust_share
-    errors = [
-        _error(row, q, limit) for q, limit in _shown_limits(run.criterion).items()
-    ]
+    first, (share, depth, force) = row.first, row.proof
+    limits = _shown_limits(run.criterion)
+    errors = dict(_error(row, q, limit) for q, limit in limits.items())
     baselines = {
         f"{BASELINE_WORDS.get(b, b)}, mm / deg": (_baseline(row, b), "")
         for b in run.baselines
@@ -134,11 +133,11 @@ def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
         "attempts": (f"{len(row.lines):,}", ""),
         "env steps": (f"{first['env_steps']:,}" if first else NOTHING, ""),
         "minutes": (number(first["wall_s"] / 60) if first else NOTHING, ""),
-        **dict(errors),
+        **errors,
         "certificate": _verdict(row),
         "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
-        "penetration mm": (number(row.penetration_mm), ""),
-        "force N": (number(row.force), ""),
+        "penetration mm": (number(depth), ""),
+        "force N": (number(force), ""),
         **baselines,
         "failures": (row.failures or NOTHING, ""),
     }

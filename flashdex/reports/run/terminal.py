@@ -24,8 +24,6 @@ from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shor
 
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
-HEADINGS = ("motion", "hand", "tries", "steps", "min", "mm", "deg")
-PROOF = ("proof", "pert", "pen", "N")
 STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
 
 
@@ -34,9 +32,10 @@ def run_table(run_dir: str | Path) -> str:
     run = load_run(run_dir)
     rows = motion_facts(run)
     names = list(run.baselines)[: len(BASELINES)]
-    cells = [[*HEADINGS, *PROOF, *(BASELINES.get(b, b)[:8] for b in names)]]
-    cells += [_cells(row, names) for row in rows]
-    lines = align(cells) if rows else ["no motion has been attempted yet"]
+    found = [_cells(row, names) for row in rows]
+    lines = ["no motion has been attempted yet"]
+    if found:
+        lines = align([list(found[0]), *(list(cells.values()) for cells in found)])
     out = [*_headline(run, rows), "", *lines, "", *_failures(rows), *_legend(run)]
     return "\n".join(line[:MAX_WIDTH].rstrip() for line in out)
 
@@ -55,23 +54,23 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     ]
 
 
-def _cells(row: MotionFacts, baselines: list[str]) -> list[str]:
-    first = row.first or {}
-    share = row.robust_share
-    return [
-        shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
-        "+".join(side[0].upper() for side in row.hands) or "-",
-        str(len(row.lines)),
-        short(first["env_steps"]) if first else "-",
-        plain(first["wall_s"] / 60) if first else "-",
-        _error(row.errors, "object_pos"),
-        _error(row.errors, "object_rot"),
-        row.verdict or "-",
-        "-" if share is None else f"{share:.0%}",
-        plain(row.penetration_mm),
-        plain(row.force, 0),
-        *(_baseline(row.baselines.get(name)) for name in baselines),
-    ]
+def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
+    first, (share, depth, force) = row.first, row.proof
+    scores = {BASELINES.get(b, b)[:8]: row.baselines.get(b) for b in baselines}
+    return {
+        "motion": shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
+        "hand": "+".join(side[0].upper() for side in row.hands) or "-",
+        "tries": str(len(row.lines)),
+        "steps": short(first["env_steps"]) if first else "-",
+        "min": plain(first["wall_s"] / 60) if first else "-",
+        "mm": _error(row.errors, "object_pos"),
+        "deg": _error(row.errors, "object_rot"),
+        "proof": row.verdict or "-",
+        "pert": "-" if share is None else f"{share:.0%}",
+        "pen": plain(depth),
+        "N": plain(force, 0),
+        **{name: _baseline(score) for name, score in scores.items()},
+    }
 
 
 def _error(errors: Mapping[str, float], quantity: str, *, digits: int = 1) -> str:

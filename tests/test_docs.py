@@ -180,7 +180,8 @@ def test_data_page_names_exactly_the_codes_of_a_report():
     from flashdex.reports.library.facts import CODES
 
     code = re.compile(r"\b[EIRW]_[A-Z]{2,}\b")
-    files = (ROOT / "flashdex/motions").rglob("*.py")
+    parts = ("flashdex/motions", "flashdex/datasets")
+    files = (file for part in parts for file in (ROOT / part).rglob("*.py"))
     written = {name for file in files for name in code.findall(file.read_text())}
     assert written == first_cells("data.md", "Codes")
     assert written <= set(CODES)  # the report says what they mean

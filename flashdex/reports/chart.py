@@ -21,34 +21,23 @@ Points = list[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Series:
-    """One curve.
-
-    Args:
-        name: shown in the legend when there are several curves.
-        x: positions, (n,).
-        y: values, (n,); pairs that are not finite are left out.
-    """
+    """One curve of n points; its name is shown when there are several curves."""
 
     name: str
     x: Sequence[float]
     y: Sequence[float]
 
     def points(self) -> Points:
-        """Finite pairs in order."""
+        """Pairs in order; what is not finite is left out."""
         pairs = zip(self.x, self.y, strict=True)
         return [(x, y) for x, y in pairs if math.isfinite(x) and math.isfinite(y)]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Map from values to the drawing.
+    """Map from values, ``low`` to ``high``, to the drawing, ``start`` to ``end``.
 
-    Args:
-        low: value at ``start``.
-        high: value at ``end``.
-        ticks: values with a label.
-        start: pixels.
-        end: pixels.
+    Ticks are values with a label; start and end are pixels.
     """
 
     low: float
@@ -90,13 +79,13 @@ def line_chart(
     is_step: bool = False,
     y_range: tuple[float, float] | None = None,
 ) -> Markup:
-    """Draw curves over one pair of axes.
+    """Draw curves over one pair of axes; one without points is left out.
 
     Args:
-        series: curves; one without points is left out.
-        title: heading above the axes.
-        x_label: under the axis, with its unit.
-        y_label: beside the heading, with its unit.
+        series: curves.
+        title: heading above the axes; the label of y stands beside it.
+        x_label: with its unit.
+        y_label: with its unit.
         is_step: hold each value until the next point, as counts want it.
         y_range: values that are in sight in any case.
 
@@ -134,14 +123,7 @@ def line_chart(
 def draw_chart(
     title: str, x_axis: Axis | None = None, *, x_label: str = "", **drawn: Any
 ) -> Markup:
-    """Fill ``chart.svg``.
-
-    Args:
-        title: heading above the axes.
-        x_axis: None for a chart without data.
-        x_label: under the axis, with its unit.
-        **drawn: what the template names besides.
-    """
+    """Fill ``chart.svg`` with what is drawn; without an axis there is no data."""
     frame = {"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT}
     frame["base"] = HEIGHT - BOTTOM
     return render(

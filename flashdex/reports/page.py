@@ -22,13 +22,10 @@ def render(template: str, **content: Any) -> Markup:
 def write_page(
     path: Path, template: str, *, error: type[FlashdexError], **content: Any
 ) -> Path:
-    """Write a page, complete or not at all.
+    """Write a page from a file of ``templates/``, complete or not at all.
 
-    Args:
-        path: the page.
-        template: file of ``templates/``.
-        error: raised when the page cannot be written.
-        **content: names of the template.
+    Raises:
+        FlashdexError: of the class ``error``; the page cannot be written.
     """
     # half of a surrogate pair in a name is no character and cannot be written
     text = render(template, **content).encode("utf-8", errors="replace").decode("utf-8")

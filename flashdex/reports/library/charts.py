@@ -39,15 +39,10 @@ BAR_GAP = 1.5  # pixels above and below a bar
 
 
 def histogram(recordings: Sequence[RecordingFacts], column: str) -> Markup:
-    """How many motions of the library have a figure in each of equal bins.
+    """How many motions of the library have one of ``FIGURES`` in each of equal bins.
 
-    Args:
-        recordings: those without the figure are left out.
-        column: of ``report.csv``, one of ``FIGURES``.
-
-    Returns:
-        An SVG; the last bin holds all beyond it, so that one wild value does not
-        squeeze the others into one bin.
+    The last bin holds all beyond it, so that one wild value does not squeeze the
+    others into one bin.
     """
     title, unit = FIGURES[column]
     found = {s: _values(recordings, column, s) for s in ("kept", "flagged")}
@@ -77,12 +72,7 @@ def _values(
 
 
 def motion_charts(library: MotionLibrary, row: int) -> list[Markup]:
-    """Charts of one motion over its time, as SVG.
-
-    Args:
-        library: without ``quality`` the first two charts are left out.
-        row: motion.
-    """
+    """Charts of one motion over its time; without ``quality`` two are left out."""
     charts = []
     if library.quality is not None:
         quality = library.quality[frames_of(library, row)]

@@ -23,7 +23,7 @@ from flashdex.reports.library.facts import (
 )
 from flashdex.reports.page import write_page
 from flashdex.reports.render.stills import draw_thumbnails, still_frames
-from flashdex.reports.text import MAX_WIDTH, align, duration, number, plain, shorten
+from flashdex.reports.text import MAX_WIDTH, align, duration, plain, shorten
 
 REPORT = "report.html"
 MAX_CARDS = 150  # a page of 2,000 cards would not open
@@ -71,7 +71,9 @@ def write_library_report(
         versions=library.manifest.get("versions") or {},
         motion_s=len(library.frames) / library.fps,
         counts=count_statuses(recordings),
-        sources=_sources(recordings),
+        sources=by_source(recordings),
+        count_statuses=count_statuses,
+        seconds_of=seconds_of,
         codes=count_codes(recordings),
         meanings=CODES,
         histograms=[histogram(recordings, column) for column in FIGURES],
@@ -82,17 +84,6 @@ def write_library_report(
         cards=[_card(library, row, inside[row], stills.get(row)) for row in rows],
         fault=fault,
     )
-
-
-def _sources(recordings: Sequence[RecordingFacts]) -> list[list[Any]]:
-    rows = []
-    for source, group in by_source(recordings).items():
-        licences = sorted({one.licence for one in group if one.licence})
-        told = ", ".join(licences) or "not recorded"
-        counts = count_statuses(group).values()
-        seconds = number(seconds_of(group))
-        rows.append([source, told, f"{len(group):,}", *counts, seconds])
-    return rows
 
 
 def _card(

@@ -25,13 +25,7 @@ LEFT_OUT = ("episode/ends",)  # a count among shares
 def conversion_charts(
     run: RunData, facts: list[MotionFacts], *, total: int
 ) -> list[Markup]:
-    """Cumulative conversions over env steps and over time of training.
-
-    Args:
-        run: the files.
-        facts: rows of the motions.
-        total: motions of the collection; the axis ends there.
-    """
+    """Cumulative conversions over env steps and time; the axis ends at the total."""
     lines = sorted((f.first for f in facts if f.first), key=lambda x: x["env_steps"])
     unit, seconds = ("hours", 3600.0)
     if run.wall_s < MINUTES_BELOW_S:

@@ -127,13 +127,9 @@ def evaluation_table(
         cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors])
     counts = [_rate(totals[name]) for name in names]
     cells.append([f"all {len(rows)}", *counts, "", ""])
-    lines = [
-        f"policy of {totals.get('env_steps', 0):,} env steps",
-        "",
-        *align(cells),
-        "",
-    ]
-    return "\n".join([*lines, *_means(totals), "n.m.: not measured on this motion"])
+    head = f"policy of {totals.get('env_steps', 0):,} env steps"
+    notes = [*_means(totals), "n.m.: not measured on this motion"]
+    return "\n".join([head, "", *align(cells), "", *notes])
 
 
 def _rate(states: Mapping[str, int]) -> str:
@@ -151,12 +147,7 @@ def _means(totals: Mapping[str, Any]) -> list[str]:
 
 
 def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
-    """Every criterion of one stored rollout, with the numbers that were compared.
-
-    Args:
-        name: heading, usually the file.
-        verdicts: result of ``metrics.criteria.score``.
-    """
+    """Every criterion of a stored rollout, with the numbers that were compared."""
     cells = [["criterion", "state", "values against limits"]]
     for verdict in verdicts.values():
         parts = [
@@ -192,12 +183,12 @@ def gym_run_table(run_dir: str | Path) -> str:
     found = [record for record in run.metrics if "eval/return" in record]
     if not found:
         return f"{head}\nnot evaluated yet; records: {run.path / 'metrics.jsonl'}"
-    lines = [f"{'env steps':>12} {'return':>9} {'std':>8} {'length':>7}"]
-    lines += [
-        f"{int(r['env_steps']):>12,} {r['eval/return']:>9.1f} "
-        f"{r['eval/return_std']:>8.1f} {r['eval/length']:>7.0f}"
-        for r in found[-ROWS:]
-    ]
+    cells = [["env steps", "return", "std", "length"]]
+    for r in found[-ROWS:]:
+        values = (r["eval/return"], r["eval/return_std"])
+        figures = [f"{value:.1f}" for value in values]
+        cells.append([f"{int(r['env_steps']):,}", *figures, f"{r['eval/length']:.0f}"])
+    lines = align(cells, left=())
     return "\n".join([head, "", *lines, "", f"records: {run.path / 'metrics.jsonl'}"])
 
 

@@ -15,5 +15,6 @@ setup(
     package_data={
         "": ["*.yaml"],
         "flashdex": ["hands/**/*.xml", "hands/**/*.json", "py.typed"],
+        "flashdex.reports": ["templates/*"],
     },
 )

@@ -13,7 +13,7 @@ from PIL import Image
 
 from flashdex.reports.render import films
 from flashdex.reports.render.films import NO_GRAPHICS, Film, draw_films, find_backend
-from flashdex.reports.render.rollout import MARGIN, fit_view, view_axes
+from flashdex.reports.render.scene import MARGIN, fit_view, view_axes
 from flashdex.reports.run.report import write_report
 
 DRAW = """

@@ -19,13 +19,13 @@ from tensordict import TensorDict
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
 from flashdex.reports.library import report as library_report
-from flashdex.reports.library.cards import contact_timeline, motion_charts
-from flashdex.reports.library.facts import CODES, RecordingFacts, library_facts
-from flashdex.reports.library.report import (
+from flashdex.reports.library.charts import (
+    contact_timeline,
     histogram,
-    summary_lines,
-    write_library_report,
+    motion_charts,
 )
+from flashdex.reports.library.facts import CODES, RecordingFacts, library_facts
+from flashdex.reports.library.report import summary_lines, write_library_report
 from flashdex.reports.render.films import NO_GRAPHICS, find_backend
 from flashdex.reports.render.stills import contact_of, draw_thumbnails, still_frames
 
@@ -230,7 +230,7 @@ def test_codes_are_counted_once_a_recording(mine):
 
 
 def test_every_documented_code_has_a_meaning():
-    docs = Path(library_report.__file__).parents[2] / "docs" / "data.md"
+    docs = Path(library_report.__file__).parents[3] / "docs" / "data.md"
     documented = set(re.findall(r"^\| `([EWRI]_\w+)` \|", docs.read_text(), re.M))
     assert len(documented) > 10
     assert documented <= set(CODES)

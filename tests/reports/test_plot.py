@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from flashdex.reports.page import (
+from flashdex.reports.chart import (
     HEIGHT,
     WIDTH,
     Series,

@@ -4,13 +4,11 @@ import json
 
 from flashdex.metrics.criteria import score
 from flashdex.reports.run.terminal import (
-    align,
     evaluation_table,
     run_table,
     score_table,
-    short,
-    shorten,
 )
+from flashdex.reports.text import align, short, shorten
 
 
 def row_of(text, name):

@@ -77,7 +77,7 @@ class RecordingFacts:
 
     Args:
         name: of the motion.
-        status: kept, flagged or rejected.
+        status: one of ``STATUSES``.
         reason: codes with their text.
         figures: every other column, as written.
         row: of the library, None when it is not in it.
@@ -109,11 +109,7 @@ class RecordingFacts:
         return max(shares, default=0.0)
 
     def value(self, column: str) -> float | None:
-        """A figure as a number; None when it is not there or not finite.
-
-        Args:
-            column: of ``report.csv``.
-        """
+        """A column as a number; None when it is not there or not finite."""
         try:
             value = float(self.figures.get(column, ""))
         except ValueError:
@@ -127,46 +123,35 @@ def library_facts(library: MotionLibrary) -> list[RecordingFacts]:
     Rejected recordings are only in ``report.csv``; a motion that it does not name is
     taken from the manifest.
 
-    Args:
-        library: the prepared collection.
-
     Raises:
         LibraryError: ``report.csv`` is not a table.
     """
-    written = _read_report(library.path / "report.csv")
-    motions = {m["name"]: m for m in library.manifest["motions"]}
-    rows = {name: row for row, name in enumerate(library.names)}
+    # a library of several sources has a list here, which says nothing about one motion
+    source = library.manifest.get("source", "")
+    source = source if isinstance(source, str) else ""
+    motions = {m["name"]: (row, m) for row, m in enumerate(library.manifest["motions"])}
     facts = []
-    for line in written:
-        name = line.get("motion", "")
-        inside = line.get("status") != "rejected" and name in rows
-        row = rows.pop(name, None) if inside else None
-        info = motions[name] if row is not None else {}
-        facts.append(_make(line, info, row, _source_of(library)))
-    for name, row in rows.items():
-        seconds = int(library.motions["length"][row]) / library.fps
-        line = {"motion": name, "status": "kept", **_texts(motions[name])}
-        line["seconds"] = f"{seconds:.3f}"
-        facts.append(_make(line, motions[name], row, _source_of(library)))
+    for line in _read_report(library.path / "report.csv"):
+        row, info = None, {}
+        if line.get("status") != "rejected":
+            row, info = motions.pop(line.get("motion", ""), (row, info))
+        facts.append(_make(line, info, row, source))
+    for name, (row, info) in motions.items():
+        line = {"motion": name, "status": "kept"}
+        line |= {k: str(info[k]) for k in ("status", "reason") if k in info}
+        line["seconds"] = f"{int(library.motions['length'][row]) / library.fps:.3f}"
+        facts.append(_make(line, info, row, source))
     return worst_first(facts)
 
 
 def facts_of_rows(rows: Iterable[Mapping[str, Any]]) -> list[RecordingFacts]:
-    """The same of rows that ``prepare`` has made, the worst first.
-
-    Args:
-        rows: columns of ``report.csv`` by name.
-    """
+    """The same of rows that ``prepare`` has made: columns of ``report.csv`` by name."""
     lines = [{k: str(v) for k, v in row.items() if v is not None} for row in rows]
     return worst_first([_make(line, {}, None, "") for line in lines])
 
 
 def worst_first(facts: Iterable[RecordingFacts]) -> list[RecordingFacts]:
-    """Rejected before flagged before kept; within each the worst figure first.
-
-    Args:
-        facts: recordings.
-    """
+    """Rejected before flagged before kept; within each the worst figure first."""
 
     def place(one: RecordingFacts) -> tuple[int, float]:
         known = one.status in STATUSES
@@ -176,21 +161,14 @@ def worst_first(facts: Iterable[RecordingFacts]) -> list[RecordingFacts]:
 
 
 def columns_of(facts: Sequence[RecordingFacts]) -> list[str]:
-    """Columns of ``report.csv`` besides motion, status and reason, in order.
-
-    Args:
-        facts: recordings; a rejected one may have fewer columns.
-    """
+    """Columns of ``report.csv`` besides motion, status and reason, in order."""
+    # a rejected recording may have fewer columns
     longest = sorted(facts, key=lambda one: -len(one.figures))
     return list(dict.fromkeys(column for one in longest for column in one.figures))
 
 
 def count_statuses(facts: Iterable[RecordingFacts]) -> dict[str, int]:
-    """Number of recordings of each status, every status named.
-
-    Args:
-        facts: recordings.
-    """
+    """Number of recordings of each status, every status named."""
     counts = Counter(one.status for one in facts)
     return {status: counts[status] for status in reversed(STATUSES)}
 
@@ -198,8 +176,7 @@ def count_statuses(facts: Iterable[RecordingFacts]) -> dict[str, int]:
 def count_codes(facts: Sequence[RecordingFacts]) -> dict[str, dict[str, int]]:
     """Recordings of each status by code, the most frequent code first.
 
-    Args:
-        facts: recordings; a code counts once in each.
+    A code counts once in each recording.
     """
     totals = Counter(code for one in facts for code in one.codes)
     return {
@@ -209,11 +186,7 @@ def count_codes(facts: Sequence[RecordingFacts]) -> dict[str, dict[str, int]]:
 
 
 def by_source(facts: Iterable[RecordingFacts]) -> dict[str, list[RecordingFacts]]:
-    """Recordings by source, the largest first.
-
-    Args:
-        facts: recordings.
-    """
+    """Recordings by source, the largest first."""
     groups: dict[str, list[RecordingFacts]] = {}
     for one in facts:
         groups.setdefault(one.source or "not recorded", []).append(one)
@@ -221,11 +194,7 @@ def by_source(facts: Iterable[RecordingFacts]) -> dict[str, list[RecordingFacts]
 
 
 def seconds_of(facts: Iterable[RecordingFacts]) -> float:
-    """Seconds of the motions that are not rejected.
-
-    Args:
-        facts: recordings.
-    """
+    """Seconds of the motions that are not rejected."""
     inside = (one for one in facts if one.status != "rejected")
     return sum(one.value("seconds") or 0.0 for one in inside)
 
@@ -243,17 +212,6 @@ def _make(
         source=str(line.get("source") or info.get("source") or source),
         licence=str(info.get("licence") or line.get("licence") or ""),
     )
-
-
-def _texts(info: Mapping[str, Any]) -> dict[str, str]:
-    """What the manifest says about status and reason of a motion."""
-    return {k: str(info[k]) for k in ("status", "reason") if k in info}
-
-
-def _source_of(library: MotionLibrary) -> str:
-    # a library of several sources has a list here, which says nothing about one motion
-    source = library.manifest.get("source", "")
-    return source if isinstance(source, str) else ""
 
 
 def _read_report(path: Path) -> list[dict[str, str]]:

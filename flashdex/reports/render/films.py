@@ -23,46 +23,32 @@ _PROBE = (
 
 @dataclass(frozen=True)
 class Film:
-    """Files of one drawn rollout.
-
-    Args:
-        video: mp4.
-        stills: pictures side by side, png.
-        poster: first picture, png.
-    """
+    """Files of one drawn rollout: mp4; as png, pictures side by side and the first."""
 
     video: Path
     stills: Path
     poster: Path
 
     @classmethod
-    def of(cls, rollout: Path) -> Film:
-        """Where the pictures of a stored rollout lie.
+    def at(cls, base: Path) -> Film:
+        """Files that have the name ``base``, which has no suffix."""
+        endings = (".mp4", ".png", "_poster.png")
+        return cls(*(base.with_name(base.name + ending) for ending in endings))
 
-        Args:
-            rollout: ``rollouts/<motion>.npz`` of a run.
-        """
-        base = rollout.parent.parent / FOLDER / rollout.stem
-        return cls(
-            *(base.with_name(base.name + e) for e in (".mp4", ".png", "_poster.png"))
-        )
+    @classmethod
+    def of(cls, rollout: Path) -> Film:
+        """Where the pictures of ``rollouts/<motion>.npz`` of a run lie."""
+        return cls.at(rollout.parent.parent / FOLDER / rollout.stem)
 
     def is_newer_than(self, rollout: Path) -> bool:
-        """All files exist and were drawn after the rollout was stored.
-
-        Args:
-            rollout: the stored file.
-        """
+        """All files exist and were drawn after the rollout was stored."""
         files = (self.video, self.stills, self.poster)
         stored = rollout.stat().st_mtime
         return all(f.is_file() and f.stat().st_mtime >= stored for f in files)
 
 
 def draw_films(rollouts: list[Path]) -> str:
-    """Draw what is not drawn yet.
-
-    Args:
-        rollouts: stored rollouts of one run.
+    """Draw what is not drawn yet of the stored rollouts of a run.
 
     Returns:
         Why pictures are missing, empty when all are there. Never raises: a run is worth

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -17,7 +18,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from flashdex.errors import FlashdexError
 from flashdex.geometry.rotation import quat_rotate
 from flashdex.hands.attach import add_hand
 from flashdex.hands.spec import load_hand
@@ -25,13 +25,7 @@ from flashdex.keys import SIDES
 from flashdex.motions.contact.fingertips import contact_runs
 from flashdex.motions.library import MotionLibrary
 from flashdex.reports.render import films
-from flashdex.reports.render.rollout import (
-    AZIMUTHS,
-    ELEVATION,
-    dress_scene,
-    fit_view,
-    view_axes,
-)
+from flashdex.reports.render.scene import ScenePainter, draw_each
 
 WIDTH, HEIGHT = 256, 192  # of one still, pixels
 QUALITY = 80  # of the JPEG
@@ -43,11 +37,7 @@ DISC = (0.8, 0.8, 0.78, 1.0)
 def draw_thumbnails(
     library: MotionLibrary, rows: Sequence[int]
 ) -> tuple[dict[int, bytes], str]:
-    """Draw a strip of stills of each motion, at ``still_frames``.
-
-    Args:
-        library: the prepared collection.
-        rows: motions to draw.
+    """Draw a strip of stills of each of some motions, at ``still_frames``.
 
     Returns:
         JPEG data by motion row, and why pictures are missing, empty when all are there.
@@ -70,12 +60,7 @@ def draw_thumbnails(
 
 
 def frames_of(library: MotionLibrary, row: int) -> slice:
-    """Rows of the frame axis that belong to a motion.
-
-    Args:
-        library: the prepared collection.
-        row: motion.
-    """
+    """Rows of the frame axis that belong to a motion."""
     start = int(library.motions["start"][row])
     return slice(start, start + int(library.motions["length"][row]))
 
@@ -83,9 +68,7 @@ def frames_of(library: MotionLibrary, row: int) -> slice:
 def contact_of(library: MotionLibrary, row: int) -> np.ndarray:
     """Human fingers in contact, (T, 2, 5) bool, hands [left, right].
 
-    Args:
-        library: where no contacts are stored, they follow from the tip distances.
-        row: motion.
+    Where no contacts are stored, they follow from the tip distances.
     """
     span = frames_of(library, row)
     if library.quality is not None:
@@ -99,10 +82,6 @@ def contact_of(library: MotionLibrary, row: int) -> np.ndarray:
 def still_frames(library: MotionLibrary, row: int) -> dict[str, int]:
     """Frames worth a picture: start, first contact, middle, end.
 
-    Args:
-        library: the prepared collection.
-        row: motion.
-
     Returns:
         Four frames of the motion by word; without contact, a quarter stands in.
     """
@@ -112,8 +91,8 @@ def still_frames(library: MotionLibrary, row: int) -> dict[str, int]:
     return {"start": 0, **first, "middle": length // 2, "end": length - 1}
 
 
-class StillPainter:
-    """Draws single frames of a motion's reference.
+class StillPainter(ScenePainter):
+    """Draws single frames of a motion's reference, each as near as it may be.
 
     Args:
         library: the prepared collection.
@@ -136,26 +115,7 @@ class StillPainter:
         for slot, object_row in enumerate(self._objects):
             _add_object(scene, library, object_row, slot)
         _add_discs(scene, library.motions["support_disks"][row].tolist())
-        dress_scene(scene, width=WIDTH, height=HEIGHT)
-        self.model = scene.compile()
-        self._data = mujoco.MjData(self.model)
-        self._renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
-        self._azimuth = self._choose_azimuth()
-
-    def close(self) -> None:
-        """Free the graphics context."""
-        self._renderer.close()
-
-    def draw(self, frame: int) -> np.ndarray:
-        """Picture of one frame, as near as it may be, (HEIGHT, WIDTH, 3) uint8.
-
-        Args:
-            frame: of the motion.
-        """
-        self._place(frame)
-        camera = self._make_camera(self._azimuth, frame)
-        self._renderer.update_scene(self._data, camera)
-        return self._renderer.render()
+        super().__init__(scene, size=(WIDTH, HEIGHT), middle=len(self._frames) // 2)
 
     def _place(self, frame: int) -> None:
         data, now = self._data, self._frames[frame]
@@ -164,49 +124,18 @@ class StillPainter:
         for slot in range(len(self._objects)):
             data.mocap_pos[slot] = now["object_pos"][slot].numpy()
             data.mocap_quat[slot] = now["object_quat"][slot].numpy()
-        mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_comPos(self.model, data)
-        mujoco.mj_camlight(self.model, data)
-
-    def _choose_azimuth(self) -> float:
-        """Look from where the most of the objects is seen half way through."""
-        middle = len(self._frames) // 2
-        self._place(middle)
-        self._renderer.enable_segmentation_rendering()
-        cameras = [self._make_camera(azimuth, middle) for azimuth in AZIMUTHS]
-        seen = [self._count_object_pixels(camera) for camera in cameras]
-        self._renderer.disable_segmentation_rendering()
-        return AZIMUTHS[int(np.argmax(seen))]
-
-    def _make_camera(self, azimuth: float, frame: int) -> mujoco.MjvCamera:
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.azimuth, camera.elevation = azimuth, ELEVATION
-        camera.lookat[:], camera.distance = fit_view(
-            self._points(frame),
-            view_axes(azimuth, ELEVATION),
-            fovy=float(self.model.vis.global_.fovy),
-            aspect=WIDTH / HEIGHT,
-        )
-        return camera
 
     def _points(self, frame: int) -> np.ndarray:
-        """World positions that must be in sight, m, (n, 3)."""
         now = self._frames[frame]
         hands = now["keypoints"][self._hands].reshape(-1, 3)
         slots = slice(len(self._objects))
-        pos, quat = now["object_pos"][slots], now["object_quat"][slots]
-        objects = (quat_rotate(quat[:, None], self._corners) + pos[:, None]).flatten(
-            0, 1
-        )
-        points = torch.cat([hands, objects]).double().numpy()
+        pos, quat = now["object_pos"][slots, None], now["object_quat"][slots, None]
+        objects = quat_rotate(quat, self._corners) + pos
+        points = torch.cat([hands, objects.flatten(0, 1)]).double().numpy()
         return points[np.isfinite(points).all(axis=1)]
 
-    def _count_object_pixels(self, camera: mujoco.MjvCamera) -> int:
-        self._renderer.update_scene(self._data, camera)
-        ids = self._renderer.render()[..., 0]
-        moved = self.model.body_mocapid[self.model.geom_bodyid] >= 0
-        return int(np.isin(ids, np.flatnonzero(moved)).sum())
+    def _is_object(self) -> np.ndarray:
+        return self.model.body_mocapid >= 0
 
 
 def _corners(boxes: Tensor) -> Tensor:
@@ -243,13 +172,7 @@ def _add_discs(scene: mujoco.MjSpec, discs: list[list[float]]) -> None:
 
 
 def write_strip(library: MotionLibrary, row: int, path: Path) -> None:
-    """Draw the four stills of a motion side by side, JPEG.
-
-    Args:
-        library: the prepared collection.
-        row: motion.
-        path: the picture.
-    """
+    """Draw the four stills of a motion side by side into a JPEG."""
     painter = StillPainter(library, row)
     try:
         stills = [painter.draw(t) for t in still_frames(library, row).values()]
@@ -260,21 +183,12 @@ def write_strip(library: MotionLibrary, row: int, path: Path) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Draw motions of a library into a folder; report faults on stderr.
-
-    Args:
-        argv: library, folder, rows.
-    """
+    """Draw rows of a library into a folder; report faults on stderr."""
     library, folder = MotionLibrary.load(argv[0]), Path(argv[1])
-    faults = 0
-    for row in map(int, argv[2:]):
-        try:
-            write_strip(library, row, folder / f"{row}.jpg")
-        except (FlashdexError, OSError, ValueError) as error:
-            faults += 1
-            line = " ".join(str(error).split())
-            sys.stderr.write(f"{library.names[row]}: {line}\n")
-    return int(faults > 0)
+    return draw_each(
+        (library.names[row], partial(write_strip, library, row, folder / f"{row}.jpg"))
+        for row in map(int, argv[2:])
+    )
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,12 @@ class RunData:
         return str(self.recipe.get("train", {}).get("criterion", "sr_mt_obj"))
 
     @property
+    def ablation(self) -> str:
+        """Name of the ablation, empty without one."""
+        name = str(self.recipe.get("ablation") or "none")
+        return "" if name == "none" else name
+
+    @property
     def env_steps(self) -> int:
         """Env steps so far."""
         lines = [*self.metrics[-1:], *self.attempts[-1:]]
@@ -61,10 +67,7 @@ class RunData:
 
 
 def load_run(run_dir: str | Path) -> RunData:
-    """Read a run directory.
-
-    Args:
-        run_dir: folder with a ``recipe.yaml``.
+    """Read the folder that has a ``recipe.yaml``.
 
     Raises:
         RunError: this is no run directory, or a file in it is broken.
@@ -83,22 +86,18 @@ def load_run(run_dir: str | Path) -> RunData:
     return RunData(
         path=path,
         recipe=composed if isinstance(composed, dict) else {},
-        versions=read_json(path / "versions.json"),
+        versions=_read_json(path / "versions.json"),
         metrics=_drop_repeated(
-            read_lines(path / "metrics.jsonl", needs=("env_steps",))
+            _read_lines(path / "metrics.jsonl", needs=("env_steps",))
         ),
-        attempts=read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
-        baselines=read_json(path / "baselines.json"),
+        attempts=_read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
+        baselines=_read_json(path / "baselines.json"),
         certificates=_certificates(path / "rollouts"),
     )
 
 
-def read_json(path: Path) -> Line:
-    """Read a JSON object; a file that does not exist is an empty one.
-
-    Args:
-        path: the file.
-    """
+def _read_json(path: Path) -> Line:
+    """A JSON object; a file that does not exist is an empty one."""
     if not path.is_file():
         return {}
     try:
@@ -110,34 +109,22 @@ def read_json(path: Path) -> Line:
     return found
 
 
-def read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
-    """Read JSON lines; a last line that a crash cut off is left out.
-
-    Args:
-        path: the file; an absent one has no lines.
-        needs: keys that every line has.
-
-    Raises:
-        RunError: a line before the last is broken, or lacks a key.
-    """
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
+def _read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
+    """JSON lines with these keys; a last line that a crash cut off is left out."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     found = []
     for number, text in enumerate(lines, start=1):
+        where = f"{path}: line {number}"
         try:
             line = json.loads(text)
         except ValueError as error:
             if number == len(lines):
                 break
-            raise RunError(
-                f"{path}: line {number} is not JSON ({error}). Remove the line."
-            ) from error
+            fault = f"{where} is not JSON ({error}). Remove the line."
+            raise RunError(fault) from error
         absent = [key for key in needs if not isinstance(line, dict) or key not in line]
         if absent:
-            raise RunError(
-                f"{path}: line {number} lacks {', '.join(absent)}. Remove the line."
-            )
+            raise RunError(f"{where} lacks {', '.join(absent)}. Remove the line.")
         found.append(line)
     return found
 
@@ -154,7 +141,7 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
 def _certificates(folder: Path) -> dict[str, Line]:
     found = {}
     for path in sorted(folder.glob("*.certificate.json")):
-        certificate = read_json(path)
+        certificate = _read_json(path)
         name = certificate.get("identity", {}).get("motion")
         found[name or path.name.removesuffix(".certificate.json")] = certificate
     return found
@@ -174,40 +161,65 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class MotionFacts:
-    """One row of the per-motion table.
+    """One row of the per-motion table: what the files of a run say about a motion.
 
     Args:
+        run: the files.
         name: motion id.
-        hands: hands that take part, as far as the files tell.
-        attempts: scored rollouts from frame 0.
-        failed: attempts that did not pass.
-        first: ledger line of the first conversion, or None.
-        errors: of the first conversion, else of the best complete attempt; m and rad.
-        completed: attempts that reached the end of the motion.
-        furthest: last frame that any attempt reached, -1 without attempts.
-        causes: (cause, hand) of failed attempts with their numbers, most first.
-        baselines: baseline -> its score of this motion.
-        trivial: baselines that pass already.
-        certificate: of the stored rollout, or empty.
+        lines: of the ledger, scored rollouts from frame 0, oldest first.
     """
 
+    run: RunData
     name: str
-    hands: tuple[str, ...]
-    attempts: int
-    failed: int
-    first: Line | None
-    errors: dict[str, float]
-    completed: int
-    furthest: int
-    causes: list[tuple[tuple[str, str], int]]
-    baselines: dict[str, Line]
-    trivial: tuple[str, ...]
-    certificate: Line = field(default_factory=dict)
+    lines: list[Line]
+
+    @cached_property
+    def baselines(self) -> dict[str, Line]:
+        """Score of this motion by baseline."""
+        scores = self.run.baselines.items()
+        return {b: rows[self.name] for b, rows in scores if self.name in rows}
+
+    @cached_property
+    def first(self) -> Line | None:
+        """Ledger line of the first conversion."""
+        return next((line for line in self.lines if line.get("converted")), None)
 
     @property
     def is_converted(self) -> bool:
         """At least one attempt passed."""
         return self.first is not None
+
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Of the first conversion, else of the best complete attempt; m and rad."""
+        if self.first:
+            return self.first["errors"]
+        found = [line["errors"] for line in self.lines if line.get("errors")]
+        return min(found, key=_error_size, default={})
+
+    @property
+    def hands(self) -> tuple[str, ...]:
+        """Hands that a criterion or a cause names: an absent hand has neither."""
+        found: set[str] = set()
+        for line in [*self.lines, *self.baselines.values()]:
+            found.update(line.get("hands", []))
+            found.update(hand for _, hand in _why(line))
+            found.update(name.rpartition("_")[2] for name in line.get("passed", []))
+        return tuple(side for side in SIDES if side in found)
+
+    @property
+    def trivial(self) -> list[str]:
+        """Baselines without learning that pass already."""
+        scores = self.baselines.items()
+        criterion = self.run.criterion
+        passing = [b for b, row in scores if criterion in row.get("passed", [])]
+        named = [b for line in self.lines for b in line.get("trivial") or []]
+        return list(dict.fromkeys([*passing, *named]))
+
+    @property
+    def certificate(self) -> Line:
+        """Of the stored rollout, which counts only where the ledger claims it."""
+        return self.run.certificates.get(self.name, {}) if self.first else {}
 
     @property
     def verdict(self) -> str:
@@ -218,73 +230,42 @@ class MotionFacts:
         return str(found or "none")
 
     @property
-    def robust_share(self) -> float | None:
-        """Share of perturbed replays that passed."""
+    def proof(self) -> tuple[float | None, float | None, float | None]:
+        """Share of perturbed replays that passed; nominal: depth, mm, and force, N."""
         name = self.certificate.get("identity", {}).get("criterion")
-        return self.certificate.get("perturbed", {}).get("pass_fraction", {}).get(name)
-
-    @property
-    def penetration_mm(self) -> float | None:
-        """Largest penetration of the replay."""
-        return self.certificate.get("safety", {}).get("penetration_max_mm")
-
-    @property
-    def force(self) -> float | None:
-        """Largest normal force of the replay, N."""
-        return self.certificate.get("safety", {}).get("force_peak")
-
-    @property
-    def why(self) -> str:
-        """Most frequent cause of failure with its share of the failed attempts."""
-        if not self.causes:
-            return "" if self.attempts else "not attempted"
-        (cause, hand), count = self.causes[0]
-        share = f"{count / self.failed:.0%}"
-        return " ".join(word for word in (cause, hand, share) if word)
+        shares = self.certificate.get("perturbed", {}).get("pass_fraction", {})
+        safety = self.certificate.get("safety", {})
+        peaks = (safety.get(key) for key in ("penetration_max_mm", "force_peak"))
+        return shares.get(name), *peaks
 
     @property
     def failures(self) -> str:
-        """:attr:`why`, and how far the motion came if no attempt reached its end."""
-        if self.is_converted or self.completed or not self.attempts:
-            return self.why
-        return f"{self.why}; never completed, furthest frame {self.furthest}"
+        """Most frequent cause of failure with its share of the failed attempts.
+
+        And how far the motion came, if no attempt reached its end.
+        """
+        if not self.lines:
+            return "not attempted"
+        failed = [line for line in self.lines if not line.get("converted")]
+        causes = Counter(cause for line in failed for cause in _why(line))
+        why = ""
+        for (cause, hand), times in causes.most_common(1):
+            share = f"{times / len(failed):.0%}"
+            why = " ".join(word for word in (cause, hand, share) if word)
+        if self.is_converted or any(line.get("completed") for line in self.lines):
+            return why
+        furthest = max(line.get("frame", -1) for line in self.lines)
+        return f"{why}; never completed, furthest frame {furthest}"
 
 
 def motion_facts(run: RunData) -> list[MotionFacts]:
-    """Rows of all motions the files name, in the order of the collection.
-
-    Args:
-        run: the files.
-    """
+    """Rows of all motions the files name, in the order of the collection."""
     scored = (m for rows in run.baselines.values() for m in rows)
     names = dict.fromkeys([*scored, *(line["motion"] for line in run.attempts)])
     lines: dict[str, list[Line]] = {name: [] for name in names}
     for line in run.attempts:
         lines[line["motion"]].append(line)
-    return [_facts(run, name, lines[name]) for name in names]
-
-
-def _facts(run: RunData, name: str, lines: list[Line]) -> MotionFacts:
-    first = next((line for line in lines if line.get("converted")), None)
-    scores = {b: rows[name] for b, rows in run.baselines.items() if name in rows}
-    passing = [b for b, row in scores.items() if run.criterion in row.get("passed", [])]
-    named = [b for line in lines for b in line.get("trivial") or []]
-    failed = [line for line in lines if not line.get("converted")]
-    causes = Counter(cause for line in failed for cause in _why(line))
-    return MotionFacts(
-        name=name,
-        hands=_hands([*lines, *scores.values()]),
-        attempts=len(lines),
-        failed=len(failed),
-        first=first,
-        errors=first["errors"] if first else _best([li.get("errors") for li in lines]),
-        completed=sum(bool(line.get("completed")) for line in lines),
-        furthest=max((line.get("frame", -1) for line in lines), default=-1),
-        causes=causes.most_common(),
-        baselines=scores,
-        trivial=tuple(dict.fromkeys([*passing, *named])),
-        certificate=run.certificates.get(name, {}) if first else {},
-    )
+    return [MotionFacts(run, name, found) for name, found in lines.items()]
 
 
 def _why(line: Line) -> set[tuple[str, str]]:
@@ -294,31 +275,13 @@ def _why(line: Line) -> set[tuple[str, str]]:
     }
 
 
-def _hands(lines: Iterable[Line]) -> tuple[str, ...]:
-    """Hands that a per-hand criterion or a cause names: an absent hand has neither."""
-    found: set[str] = set()
-    for line in lines:
-        found.update(line.get("hands", []))
-        found.update(hand for _, hand in _why(line))
-        found.update(name.rpartition("_")[2] for name in line.get("passed", []))
-    return tuple(side for side in SIDES if side in found)
-
-
-def _best(errors: Iterable[dict[str, float] | None]) -> dict[str, float]:
-    """Smallest object error: 30 degrees weigh as much as 3 cm, as in the ledger."""
-
-    def size(one: dict[str, float]) -> float:
-        return one.get("object_pos", 9.0) + 0.0573 * one.get("object_rot", 9.0)
-
-    return min((e for e in errors if e), key=size, default={})
+def _error_size(errors: dict[str, float]) -> float:
+    """Object error: 30 degrees weigh as much as 3 cm, as in the ledger."""
+    return errors.get("object_pos", 9.0) + 0.0573 * errors.get("object_rot", 9.0)
 
 
 def criterion_terms(criterion: str) -> tuple[Term, ...]:
-    """Signals and limits of a criterion; empty for one this version does not know.
-
-    Args:
-        criterion: its name.
-    """
+    """Signals and limits of a criterion; empty for one this version does not know."""
     try:
         name = resolve_criterion(criterion)
     except UnknownNameError:
@@ -327,12 +290,7 @@ def criterion_terms(criterion: str) -> tuple[Term, ...]:
 
 
 def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
-    """Motions of the collection; those without baseline and attempt are counted too.
-
-    Args:
-        run: the files.
-        facts: rows of the known motions.
-    """
+    """Motions of the collection; those without baseline and attempt are counted too."""
     for record in reversed(run.metrics):
         rate = record.get("convert/rate", 0.0)
         if rate > 0:
@@ -341,26 +299,17 @@ def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
 
 
 def count(facts: list[MotionFacts]) -> dict[str, int]:
-    """Converted motions, and how many of them are certified, robust, trivial.
-
-    Args:
-        facts: rows.
-    """
+    """Converted motions, and how many of them are certified, robust, trivial."""
     converted = [f for f in facts if f.is_converted]
     return {
         "converted": len(converted),
         "certified": sum(f.verdict in PROVEN for f in converted),
         "robust": sum(f.verdict == "robust" for f in converted),
         "trivial": sum(bool(f.trivial) for f in converted),
-        "attempts": sum(f.attempts for f in facts),
+        "attempts": sum(len(f.lines) for f in facts),
     }
 
 
 def in_unit(quantity: str, value: Any) -> float | None:
-    """Convert m or rad to the unit that is shown; None stays None.
-
-    Args:
-        quantity: a key of ``SHOWN``.
-        value: m or rad.
-    """
+    """Convert m or rad to the unit in which ``SHOWN`` has it; None stays None."""
     return None if value is None else float(value) * SHOWN[quantity][2]

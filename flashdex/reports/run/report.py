@@ -5,34 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 
 from flashdex.errors import RunError
-from flashdex.reports.page import (
-    Html,
-    duration,
-    facts,
-    inline,
-    joined,
-    number,
-    page,
-    tag,
-)
+from flashdex.reports.page import write_page
 from flashdex.reports.render.films import Film, draw_films
 from flashdex.reports.run.curves import conversion_charts, learning_charts
 from flashdex.reports.run.facts import (
+    PROVEN,
+    SHOWN,
     MotionFacts,
     RunData,
     count,
+    criterion_terms,
+    in_unit,
     load_run,
     motion_facts,
     num_motions,
 )
-from flashdex.reports.run.motion_table import motion_table, table_notes
-from flashdex.system.files import write_atomic
+from flashdex.reports.text import NOTHING, number
 
 REPORT = "report.html"
-GHOST_NOTE = (
-    "Blue, translucent: where the recording has the object; it fades where both agree."
-)
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
+BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
+Cell = tuple[str, str]  # text, and "good" or "bad" where it is marked
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -53,85 +46,42 @@ def write_report(run_dir: str | Path) -> Path:
     """
     run = load_run(run_dir)
     rows = motion_facts(run)
+    total = num_motions(run, rows)
     stored = _stored_rollouts(run, rows)
     wanted = run.recipe.get("train", {}).get("render_conversions", True)
     fault = draw_films(list(stored.values())) if wanted else ""
-    name = str(run.recipe.get("name", run.path.name))
-    text = page(f"{name}: flashdex run", _sections(run, rows, stored, fault, name))
-    path = run.path / REPORT
-    try:
-        write_atomic(path, text)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror}).") from error
-    return path
-
-
-def _sections(
-    run: RunData,
-    rows: list[MotionFacts],
-    stored: dict[str, Path],
-    fault: str,
-    name: str,
-) -> list[Html]:
-    total = num_motions(run, rows)
-    conversions = conversion_charts(run, rows, total=total)
-    parts = [
-        tag("h1", name),
-        _header(run),
-        _numbers(rows, total),
-        _promises(run),
-        tag("h2", "Conversions"),
-        tag("div", *conversions, class_="charts large"),
-        tag("h2", "Motions"),
-        motion_table(run, rows, total=total),
-        table_notes(run),
+    films = [
+        (row, film)
+        for row in rows
+        if row.name in stored and (film := Film.of(stored[row.name])).video.is_file()
     ]
-    if any(row.is_converted for row in rows):
-        parts += [tag("h2", "Films"), _films(rows, stored, fault)]
-    for heading, charts in learning_charts(run):
-        parts += [tag("h2", heading), tag("div", *charts, class_="charts")]
-    return parts
-
-
-def _header(run: RunData) -> Html:
-    recipe, versions = run.recipe, dict(run.versions)
-    hardware = versions.pop("hardware", None)
-    if isinstance(hardware, dict):
-        hardware = ", ".join(f"{k} {v}" for k, v in hardware.items())
-    steps = f"{run.env_steps:,}"
-    if recipe.get("total_env_steps"):
-        steps += f" of {recipe['total_env_steps']:,}"
-    ablation = recipe.get("ablation", "none")
-    return facts(
-        [
-            ("recipe", recipe.get("name")),
-            ("ablation", "" if ablation == "none" else ablation),
-            ("hand", recipe.get("hand")),
-            ("engine", recipe.get("physics", {}).get("engine")),
-            ("seed", recipe.get("seed")),
-            ("criterion", run.criterion),
-            ("env steps", steps),
-            ("wall time", duration(run.wall_s)),
-            ("hardware", hardware or "not recorded"),
-            ("versions", ", ".join(f"{k} {v}" for k, v in versions.items())),
-        ]
+    return write_page(
+        run.path / REPORT,
+        "run.html",
+        error=RunError,
+        name=str(run.recipe.get("name", run.path.name)),
+        run=run,
+        hardware=_hardware(run),
+        counts=count(rows),
+        promises=_promises(run),
+        conversions=conversion_charts(run, rows, total=total),
+        rows=[(row, _cells(run, row)) for row in rows],
+        total=total,
+        fault=fault,
+        films=films,
+        max_films=MAX_FILMS,
+        learning=learning_charts(run),
     )
 
 
-def _numbers(rows: list[MotionFacts], total: int) -> Html:
-    counts = count(rows)
-    cells = [
-        ("converted", f"{counts['converted']}/{total}"),
-        ("certified", f"{counts['certified']}/{counts['converted']}"),
-        ("robust", f"{counts['robust']}/{counts['converted']}"),
-        ("trivial", f"{counts['trivial']}/{counts['converted']}"),
-        ("attempts", f"{counts['attempts']:,}"),
-    ]
-    boxes = [tag("div", tag("b", value), name) for name, value in cells]
-    return tag("div", *boxes, class_="numbers")
+def _hardware(run: RunData) -> str:
+    found = run.versions.get("hardware")
+    if isinstance(found, dict):
+        return ", ".join(f"{k} {v}" for k, v in found.items())
+    return str(found or "not recorded")
 
 
-def _promises(run: RunData) -> Html:
+def _promises(run: RunData) -> list[str]:
     """What the recipe promised, beside the value at that many env steps."""
     lines = []
     for promise in run.recipe.get("expect") or []:
@@ -141,15 +91,12 @@ def _promises(run: RunData) -> Html:
         # A run that has converted everything has nothing more to reach.
         if records and records[-1].get("convert/rate") == 1.0:
             reached = reached or records[-1:]
-        bounds = [
+        bounds = " ".join(
             f"{k} {promise[k]:g}" for k in ("min", "max") if promise.get(k) is not None
-        ]
-        found = number(reached[0][key], 3) if reached else "not reached yet"
-        text = (
-            f"Promised: {key} {' '.join(bounds)} at {at:,} env steps. Found: {found}."
         )
-        lines.append(tag("p", text))
-    return joined(lines)
+        found = number(reached[0][key], 3) if reached else "not reached yet"
+        lines.append(f"Promised: {key} {bounds} at {at:,} env steps. Found: {found}.")
+    return lines
 
 
 def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
@@ -164,33 +111,60 @@ def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
     return found
 
 
-def _films(rows: list[MotionFacts], stored: dict[str, Path], fault: str) -> Html:
-    figures = [
-        _figure(row, Film.of(stored[row.name]))
-        for row in rows
-        if row.name in stored and Film.of(stored[row.name]).video.is_file()
-    ]
-    notes = [tag("p", f"{fault}.", class_="bad")] if fault else []
-    note = GHOST_NOTE if figures else "No films of this run."
-    notes.append(tag("p", note, class_="soft"))
-    if len(figures) > MAX_FILMS:
-        rest = len(figures) - MAX_FILMS
-        notes.append(tag("p", f"{rest} more films lie in the folder films/."))
-    grid = tag("div", *figures[:MAX_FILMS], class_="films")
-    return joined([*notes, grid])
+def _shown_limits(criterion: str) -> dict[str, float | None]:
+    """Errors worth a column, with limits: the object's, and what the criterion has."""
+    limits = {term.quantity: term.limit for term in criterion_terms(criterion)}
+    base = [] if "object_pos_centred" in limits else ["object_pos"]
+    shown = dict.fromkeys([*base, *limits, "object_rot"])
+    return {q: limits.get(q) for q in shown if q in SHOWN}
 
 
-def _figure(row: MotionFacts, film: Film) -> Html:
-    video = tag(
-        "video",
-        src=inline(film.video),
-        poster=inline(film.poster),
-        controls="controls",
-        loop="loop",
-        muted="muted",
-        playsinline="playsinline",
-        preload="none",
-    )
-    stills = Html(f'<img src="{inline(film.stills)}" alt="stills">')
-    caption = tag("figcaption", f"{row.name}: {row.verdict}")
-    return tag("figure", video, stills, caption)
+def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
+    """A row of the table of motions by heading, without the name."""
+    first, (share, depth, force) = row.first, row.proof
+    limits = _shown_limits(run.criterion)
+    errors = dict(_error(row, q, limit) for q, limit in limits.items())
+    baselines = {
+        f"{BASELINE_WORDS.get(b, b)}, mm / deg": (_baseline(row, b), "")
+        for b in run.baselines
+    }
+    return {
+        "hands": ("both" if len(row.hands) == 2 else "".join(row.hands) or NOTHING, ""),
+        "attempts": (f"{len(row.lines):,}", ""),
+        "env steps": (f"{first['env_steps']:,}" if first else NOTHING, ""),
+        "minutes": (number(first["wall_s"] / 60) if first else NOTHING, ""),
+        **errors,
+        "certificate": _verdict(row),
+        "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
+        "penetration mm": (number(depth), ""),
+        "force N": (number(force), ""),
+        **baselines,
+        "failures": (row.failures or NOTHING, ""),
+    }
+
+
+def _error(row: MotionFacts, quantity: str, limit: float | None) -> tuple[str, Cell]:
+    (name, unit, _), value = SHOWN[quantity], row.errors.get(quantity)
+    bound = "" if limit is None else f" (≤\u00a0{in_unit(quantity, limit):g})"
+    is_beyond = value is not None and limit is not None and value > limit
+    cell = number(in_unit(quantity, value)), "bad" if is_beyond else ""
+    return f"{name} {unit}{bound}", cell
+
+
+def _verdict(row: MotionFacts) -> Cell:
+    if not row.is_converted:
+        return NOTHING, ""
+    reason = row.certificate.get("reason", "")
+    words = row.verdict.replace("_", " ") + (f" ({reason})" if reason else "")
+    return words, "good" if row.verdict in PROVEN else "bad"
+
+
+def _baseline(row: MotionFacts, name: str) -> str:
+    if name not in row.baselines:
+        return NOTHING
+    errors = row.baselines[name].get("errors", {})
+    place = errors.get("object_pos_centred", errors.get("object_pos"))
+    shown = {"object_pos": place, "object_rot": errors.get("object_rot")}
+    words = " / ".join(number(in_unit(q, e), 0) for q, e in shown.items())
+    passes = row.run.criterion in row.baselines[name].get("passed", [])
+    return words + (" passes" if passes else "")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.recipe import task_of_run
-from flashdex.reports.page import duration, number
 from flashdex.reports.run.facts import (
     SHOWN,
     MotionFacts,
@@ -22,79 +20,67 @@ from flashdex.reports.run.facts import (
     num_motions,
 )
 from flashdex.reports.run.report import write_report
+from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shorten
 
-MAX_WIDTH = 100
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
-HEADINGS = ("motion", "hand", "tries", "steps", "min", "mm", "deg")
-PROOF = ("proof", "pert", "pen", "N")
 STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
 
 
 def run_table(run_dir: str | Path) -> str:
-    """The facts of ``report.html`` for a terminal.
-
-    Args:
-        run_dir: run directory.
-    """
+    """The facts of ``report.html`` for a terminal."""
     run = load_run(run_dir)
     rows = motion_facts(run)
     names = list(run.baselines)[: len(BASELINES)]
-    cells = [[*HEADINGS, *PROOF, *(BASELINES.get(b, b)[:8] for b in names)]]
-    cells += [_cells(row, names) for row in rows]
-    lines = align(cells) if rows else ["no motion has been attempted yet"]
+    found = [_cells(row, names) for row in rows]
+    lines = ["no motion has been attempted yet"]
+    if found:
+        lines = align([list(found[0]), *(list(cells.values()) for cells in found)])
     out = [*_headline(run, rows), "", *lines, "", *_failures(rows), *_legend(run)]
     return "\n".join(line[:MAX_WIDTH].rstrip() for line in out)
 
 
 def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     counts, recipe = count(rows), run.recipe
-    converted = counts["converted"]
-    ablation = recipe.get("ablation", "none")
-    shown = "" if ablation == "none" else f"  ablation {ablation}"
+    shown = f"  ablation {run.ablation}" if run.ablation else ""
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  "
         f"seed {recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
         f"{duration(run.wall_s)}",
-        f"{converted}/{num_motions(run, rows)} converted by {run.criterion}, "
+        f"{counts['converted']}/{num_motions(run, rows)} converted by {run.criterion}, "
         f"{counts['certified']} certified ({counts['robust']} robust), "
         f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
     ]
 
 
-def _cells(row: MotionFacts, baselines: list[str]) -> list[str]:
-    first = row.first or {}
-    share = row.robust_share
-    return [
-        shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
-        "+".join(side[0].upper() for side in row.hands) or "-",
-        str(row.attempts),
-        short(first["env_steps"]) if first else "-",
-        plain(first["wall_s"] / 60) if first else "-",
-        _error(row.errors, "object_pos"),
-        _error(row.errors, "object_rot"),
-        row.verdict or "-",
-        "-" if share is None else f"{share:.0%}",
-        plain(row.penetration_mm),
-        plain(row.force, 0),
-        *(_baseline(row.baselines.get(name)) for name in baselines),
-    ]
+def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
+    first, (share, depth, force) = row.first, row.proof
+    scores = {BASELINES.get(b, b)[:8]: row.baselines.get(b) for b in baselines}
+    return {
+        "motion": shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
+        "hand": "+".join(side[0].upper() for side in row.hands) or "-",
+        "tries": str(len(row.lines)),
+        "steps": short(first["env_steps"]) if first else "-",
+        "min": plain(first["wall_s"] / 60) if first else "-",
+        "mm": _error(row.errors, "object_pos"),
+        "deg": _error(row.errors, "object_rot"),
+        "proof": row.verdict or "-",
+        "pert": "-" if share is None else f"{share:.0%}",
+        "pen": plain(depth),
+        "N": plain(force, 0),
+        **{name: _baseline(score) for name, score in scores.items()},
+    }
 
 
-def _error(errors: Mapping[str, float], quantity: str) -> str:
-    centred = f"{quantity}_centred"
-    value = errors.get(quantity, errors.get(centred))
-    return plain(in_unit(quantity, value))
+def _error(errors: Mapping[str, float], quantity: str, *, digits: int = 1) -> str:
+    value = errors.get(quantity, errors.get(f"{quantity}_centred"))
+    return plain(in_unit(quantity, value), digits)
 
 
 def _baseline(score: Mapping[str, Any] | None) -> str:
     errors = (score or {}).get("errors", {})
-    pair = [
-        plain(in_unit(q, errors.get(q, errors.get(f"{q}_centred"))), 0)
-        for q in ("object_pos", "object_rot")
-    ]
-    return "/".join(pair)
+    return "/".join(_error(errors, q, digits=0) for q in ("object_pos", "object_rot"))
 
 
 def _failures(rows: list[MotionFacts]) -> list[str]:
@@ -141,13 +127,9 @@ def evaluation_table(
         cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors])
     counts = [_rate(totals[name]) for name in names]
     cells.append([f"all {len(rows)}", *counts, "", ""])
-    lines = [
-        f"policy of {totals.get('env_steps', 0):,} env steps",
-        "",
-        *align(cells),
-        "",
-    ]
-    return "\n".join([*lines, *_means(totals), "n.m.: not measured on this motion"])
+    head = f"policy of {totals.get('env_steps', 0):,} env steps"
+    notes = [*_means(totals), "n.m.: not measured on this motion"]
+    return "\n".join([head, "", *align(cells), "", *notes])
 
 
 def _rate(states: Mapping[str, int]) -> str:
@@ -165,12 +147,7 @@ def _means(totals: Mapping[str, Any]) -> list[str]:
 
 
 def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
-    """Every criterion of one stored rollout, with the numbers that were compared.
-
-    Args:
-        name: heading, usually the file.
-        verdicts: result of ``metrics.criteria.score``.
-    """
+    """Every criterion of a stored rollout, with the numbers that were compared."""
     cells = [["criterion", "state", "values against limits"]]
     for verdict in verdicts.values():
         parts = [
@@ -185,78 +162,17 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
 
 
 def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> str:
-    """One replayed rollout.
-
-    Args:
-        motion: its name.
-        stored: verdict in the run's files.
-        found: verdict of the replay.
-        holds: the conversion is proven and the files say so.
-    """
+    """One replayed rollout: its verdict in the run's files, and of the replay."""
     word = "holds" if holds else "DOES NOT HOLD"
     name = shorten(motion, 40)
     return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
-
-
-def align(cells: Sequence[Sequence[str]], *, left: Sequence[int] = (0,)) -> list[str]:
-    """Lay rows out in columns.
-
-    Args:
-        cells: rows of equal length.
-        left: columns aligned to the left; the others are numbers.
-    """
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        " ".join(
-            f"{cell:<{width}}" if index in left else f"{cell:>{width}}"
-            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
-
-
-def plain(value: float | None, digits: int = 1) -> str:
-    """A number without separators, or ``-``.
-
-    Args:
-        value: number or None.
-        digits: behind the point.
-    """
-    missing = value is None or not math.isfinite(value)
-    return "-" if missing else number(value, digits).replace(",", "")
-
-
-def short(value: float) -> str:
-    """Three digits and a letter: ``12.3M``.
-
-    Args:
-        value: a count.
-    """
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g}{letter}"
-    return f"{value:.0f}"
-
-
-def shorten(text: str, width: int) -> str:
-    """Cut a long text, marked by dots.
-
-    Args:
-        text: any.
-        width: characters it may have.
-    """
-    return text if len(text) <= width else f"{text[: width - 2]}.."
 
 
 ROWS = 12  # newest evaluations shown
 
 
 def gym_run_table(run_dir: str | Path) -> str:
-    """Return of the deterministic policy over env steps, newest last.
-
-    Args:
-        run_dir: run directory.
-    """
+    """Return of the deterministic policy over env steps, newest last."""
     run = load_run(run_dir)
     env_id = run.recipe.get("gym", {}).get("env_id", "?")
     head = (
@@ -267,21 +183,17 @@ def gym_run_table(run_dir: str | Path) -> str:
     found = [record for record in run.metrics if "eval/return" in record]
     if not found:
         return f"{head}\nnot evaluated yet; records: {run.path / 'metrics.jsonl'}"
-    lines = [f"{'env steps':>12} {'return':>9} {'std':>8} {'length':>7}"]
-    lines += [
-        f"{int(r['env_steps']):>12,} {r['eval/return']:>9.1f} "
-        f"{r['eval/return_std']:>8.1f} {r['eval/length']:>7.0f}"
-        for r in found[-ROWS:]
-    ]
+    cells = [["env steps", "return", "std", "length"]]
+    for r in found[-ROWS:]:
+        values = (r["eval/return"], r["eval/return_std"])
+        figures = [f"{value:.1f}" for value in values]
+        cells.append([f"{int(r['env_steps']):,}", *figures, f"{r['eval/length']:.0f}"])
+    lines = align(cells, left=())
     return "\n".join([head, "", *lines, "", f"records: {run.path / 'metrics.jsonl'}"])
 
 
 def run_summary(run_dir: Path) -> str:
-    """Table of a run; of one with motions, the report is written as well.
-
-    Args:
-        run_dir: run directory.
-    """
+    """Table of a run; of one with motions, the report is written as well."""
     if task_of_run(run_dir) == "gym":
         return gym_run_table(run_dir)
     return f"{run_table(run_dir)}\n\nreport: {write_report(run_dir)}"

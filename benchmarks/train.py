@@ -140,7 +140,7 @@ def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], flo
                 yield trainer, described, now(torch.device("cpu")) - begin
         finally:
             trainer.alongside.close()
-            trainer.judging.close(wait=False)
+            trainer.scorer.close(wait=False)
             trainer.log.close()
 
 

@@ -1,6 +1,6 @@
 """Every named success criterion as a row of one table.
 
-A criterion is a set of terms. A term takes one signal per hand, reduces it over the
+A criterion is a set of terms. A term takes one error per hand, reduces it over the
 scored frames, then over the hands, and compares it with a limit. ``criteria.score``
 applies the rows.
 """
@@ -43,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Term:
-    """One signal, its reductions over frames and hands, and its limit (m or rad)."""
+    """One error, its reductions over frames and hands, and its limit (m or rad)."""
 
     quantity: Quantity
     limit: float
@@ -165,10 +165,10 @@ class Blame:
 
     Args:
         side: the hand, or the hand of that object.
-        term: signal that was too large, e.g. ``object_pos``.
+        term: error that was too large, e.g. ``object_pos``.
         value: this hand's own value, m or rad.
         limit: m or rad.
-        frame: first scored row at which the signal itself is beyond the limit, or -1.
+        frame: first scored row at which the error itself is beyond the limit, or -1.
     """
 
     side: Side

@@ -1,4 +1,4 @@
-"""Error signals between a rollout and its reference: the raw material of every score.
+"""Errors between a rollout and its reference: the raw material of every score.
 
 Row t of a rollout is the state AFTER control step t + 1; it is compared with row t of
 the reference the step was scored on. All arithmetic is float64, so that a constant
@@ -97,7 +97,7 @@ def align_to_reference(
 
 
 @dataclass(frozen=True)
-class Signals:
+class TrackingErrors:
     """Errors of one rollout and the masks that say which of them count.
 
     Args:
@@ -112,7 +112,7 @@ class Signals:
         num_frames: T, rows of the rollout.
         num_ref_frames: T_ref, rows of the whole reference.
         fps: control rate, Hz.
-        missing: absent signal -> key that was missing.
+        missing: absent error -> key that was missing.
         overflow: the engine dropped contacts or constraints.
     """
 
@@ -167,7 +167,7 @@ class Signals:
 def _pair(
     data: Mapping[str, Array | None], key: str, rows: Sequence[int]
 ) -> tuple[Tensor, Tensor] | str:
-    """A signal's simulated and reference array, or the key that is not usable."""
+    """Simulated and reference array of an error, or the key that is not usable."""
     pair = []
     for name in (key, f"ref_{key}"):
         value = data.get(name)
@@ -190,7 +190,7 @@ def _error(
     return distance(*found[key]) if key in found else None
 
 
-def compute_signals(
+def compute_tracking_errors(
     data: Mapping[str, Array | None],
     *,
     hand_active: Sequence[bool],
@@ -198,13 +198,13 @@ def compute_signals(
     fps: float = 60.0,
     num_ref_frames: int | None = None,
     overflow: bool = False,
-) -> Signals:
-    """Errors of one rollout against its reference, as :class:`Signals` defines them.
+) -> TrackingErrors:
+    """Errors of one rollout against its reference.
 
     Args:
         data: ``object_pos`` (T, O, 3), ``object_quat`` (T, O, 4) wxyz, ``fingertips``
             (T, 2, 5, 3), ``joints`` (T, 2, M, 3), ``wrist_pos`` (T, 2, 3), each with
-            its ``ref_`` twin; world, m. What is absent makes its signal None.
+            its ``ref_`` twin; world, m. What is absent makes its error None.
         hand_active: hands [left, right] that take part.
         hand_object: object slot of each hand, -1 without object.
         fps: control rate, Hz.
@@ -217,7 +217,7 @@ def compute_signals(
         ...     "object_quat": torch.tensor([1.0, 0, 0, 0]).expand(9, 1, 4),
         ... }
         >>> data = pose | {f"ref_{k}": v for k, v in pose.items()}
-        >>> compute_signals(
+        >>> compute_tracking_errors(
         ...     data, hand_active=(False, True), hand_object=(-1, 0)
         ... ).object_rot_error.max()
         tensor(0., dtype=torch.float64)
@@ -234,12 +234,12 @@ def compute_signals(
     pos = found.get("object_pos")
     lengths = {len(sim) for sim, _ in found.values()} or {0}
     if len(lengths) > 1:
-        raise ValueError(f"signals of different length: {sorted(lengths)}")
+        raise ValueError(f"errors of different length: {sorted(lengths)}")
     total = data.get("ref_object_pos")
     num_frames = lengths.pop()
     default_ref = num_frames if total is None else len(total)
 
-    return Signals(
+    return TrackingErrors(
         object_pos_offset=None if pos is None else pos[0] - pos[1],
         object_rot_error=_error(found, "object_quat", quat_angle),
         ref_object_pos=None if pos is None else torch.as_tensor(total).double(),
@@ -263,8 +263,8 @@ def frozen_object(
     hand_active: Sequence[bool],
     hand_object: Sequence[int],
     fps: float = 60.0,
-) -> Signals:
-    """Signals of objects that stay at their first reference pose: pure arithmetic.
+) -> TrackingErrors:
+    """Errors of objects that stay at their first reference pose: pure arithmetic.
 
     Criteria with hand terms are not measured on it: there is no hand.
 
@@ -281,6 +281,6 @@ def frozen_object(
         "ref_object_pos": ref_pos,
         "ref_object_quat": ref_quat,
     }
-    return compute_signals(
+    return compute_tracking_errors(
         data, hand_active=hand_active, hand_object=hand_object, fps=fps
     )

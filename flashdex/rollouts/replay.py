@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flashdex.errors import RunError
-from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.ledger import CONVERSIONS, ROLLOUTS, read_lines
+from flashdex.rollouts.certificate import PROVEN, certify
+from flashdex.rollouts.ledger import CONVERSIONS, ROLLOUTS
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.jsonl import read_lines
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Replayed:
     @property
     def holds(self) -> bool:
         """The conversion is proven, and the files say so truthfully."""
-        return self.agrees and self.found in ("certified", "robust")
+        return self.agrees and self.found in PROVEN
 
 
 def replay(run: str | Path) -> list[Replayed]:

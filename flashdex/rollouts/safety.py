@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -62,85 +61,58 @@ def assist_sources(model: mujoco.MjModel, object_body: np.ndarray) -> list[str]:
 
 
 def normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Normal force of every contact, from the constraint forces of the last step.
-
-    Elliptic and frictionless contacts carry it in their first row; a pyramid's edges
-    add up to it.
-
-    Args:
-        model: compiled model.
-        data: after a step.
-
-    Returns:
-        N, (ncon,); 0 for contacts that are not active.
-    """
-    contact = data.contact
-    force = np.zeros(len(contact.dist))
-    is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for i in np.flatnonzero(contact.efc_address >= 0):
-        start, dim = contact.efc_address[i], contact.dim[i]
-        width = 2 * (dim - 1) if is_pyramid and dim > 1 else 1
-        force[i] = data.efc_force[start : start + width].sum()
-    return force
+    """Normal force of every contact of the last step, N, (ncon,); 0 where inactive."""
+    wrench = np.zeros((data.ncon, 6))
+    for contact, row in enumerate(wrench):
+        mujoco.mj_contactForce(model, data, contact, row)
+    return wrench[:, 0]
 
 
-@dataclass
 class SafetyMonitor:
     """Collects peaks over all substeps; call it after every ``mj_step``.
 
     Args:
-        kinds: from :func:`geom_kinds`, (ngeom,).
-        weights: weight of each object slot, N, (O,).
+        model: compiled model.
+        object_body: body of each slot, -1 when empty, (O,).
+
+    Attributes:
+        penetration_hand_object: m.
+        penetration_object_support: m.
+        force_peak: largest normal force of any contact, N.
+        force_peak_ratio: of a contact of an object, over the object's weight.
+        contacts_max: contacts at once.
     """
 
-    kinds: np.ndarray
-    weights: np.ndarray
-    penetration_hand_object: float = field(default=0.0, init=False)
-    penetration_object_support: float = field(default=0.0, init=False)
-    force_peak: float = field(default=0.0, init=False)
-    force_peak_ratio: float = field(default=0.0, init=False)
-    contacts_max: int = field(default=0, init=False)
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, object_body: np.ndarray) -> SafetyMonitor:
-        """Build from a model.
-
-        Args:
-            model: compiled model.
-            object_body: body of each slot, -1 when empty, (O,).
-        """
+    def __init__(self, model: mujoco.MjModel, object_body: np.ndarray) -> None:
         gravity = float(np.linalg.norm(model.opt.gravity))
         masses = [model.body_subtreemass[b] if b >= 0 else np.nan for b in object_body]
-        return cls(geom_kinds(model, object_body), np.array(masses) * gravity)
+        self._kinds = geom_kinds(model, object_body)
+        self._weights = np.array(masses) * gravity  # N, (O,)
+        self.penetration_hand_object = self.penetration_object_support = 0.0
+        self.force_peak = self.force_peak_ratio = 0.0
+        self.contacts_max = 0
 
     def __call__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Take in one substep.
-
-        Args:
-            model: compiled model.
-            data: after ``mj_step``.
-        """
+        """Take in one substep."""
         self.contacts_max = max(self.contacts_max, int(data.ncon))
         if not data.ncon:
             return
         geoms = data.contact.geom
         rigid = (geoms >= 0).all(axis=1)
-        pair = np.where(rigid[:, None], self.kinds[geoms], SUPPORT)
+        pair = np.where(rigid[:, None], self._kinds[geoms], SUPPORT)
         # sorted: the object's slot, if any, is last
         pair = np.sort(pair, axis=1)
         has_object = pair[:, 1] >= 0
         depth = np.maximum(-data.contact.dist, 0.0)
-        with_hand = has_object & (pair[:, 0] == HAND)
-        with_support = has_object & (pair[:, 0] == SUPPORT)
         self.penetration_hand_object = _peak(
-            self.penetration_hand_object, depth[with_hand]
+            self.penetration_hand_object, depth[has_object & (pair[:, 0] == HAND)]
         )
         self.penetration_object_support = _peak(
-            self.penetration_object_support, depth[with_support]
+            self.penetration_object_support, depth[has_object & (pair[:, 0] == SUPPORT)]
         )
         force = normal_forces(model, data)
         self.force_peak = _peak(self.force_peak, force)
-        weight = self.weights[pair[has_object, 1]]
+        weight = self._weights[pair[has_object, 1]]
         ratio = force[has_object][weight > 0] / weight[weight > 0]
         self.force_peak_ratio = _peak(self.force_peak_ratio, ratio)
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
@@ -51,69 +50,65 @@ class RolloutBuilder:
         made_by: dict[str, Any],
         provenance: dict[str, str] | None = None,
     ) -> None:
-        self.bank, self.scenes, self.hand = bank, scenes, hands["left"].name
+        self.bank, self.scenes = bank, scenes
         self.kinematics = HandKinematics(hands)
-        self.decimation, self.criterion, self.seed = decimation, criterion, seed
-        self.made_by = json.dumps(made_by)
-        self.provenance = json.dumps(provenance or {})
-        both = [hands[side] for side in keys.SIDES]
-        pairs = [[*hand.level1_links, *hand.distal_links] for hand in both]
-        # (2, M): links, and the row of each one's human keypoint
-        self._links = torch.tensor([[link for link, _ in row] for row in pairs])
-        order = [
-            [hand.keypoint_links.index(pair) for pair in row]
-            for hand, row in zip(both, pairs, strict=True)
-        ]
-        self._keypoints = torch.tensor(order)
-        names = [
-            [hand.link_names[link] for link, _ in row]
-            for hand, row in zip(both, pairs, strict=True)
-        ]
-        self._bodies = json.dumps(names)
+        links, keypoints, bodies = [], [], []
+        for side in keys.SIDES:
+            hand = hands[side]
+            pairs = [*hand.level1_links, *hand.distal_links]
+            links.append([link for link, _ in pairs])
+            keypoints.append([hand.keypoint_links.index(pair) for pair in pairs])
+            bodies.append([hand.link_names[link] for link, _ in pairs])
+        # (2, M): links of ``joints``, and the rows of their human keypoints
+        self._links, self._keypoints = torch.tensor(links), torch.tensor(keypoints)
+        self._of_run: dict[str, Any] = {
+            "hand": hands["left"].name,
+            "fps": bank.fps,
+            "decimation": decimation,
+            "grace": grace_steps(bank.fps),
+            "criterion": criterion,
+            "versions": json.dumps(made_by),
+            "seed": seed,
+            "provenance": json.dumps(provenance or {}),
+            "joint_bodies": json.dumps(bodies),
+        }
 
     def build(self, episode: Episode) -> Rollout:
         """The rollout that an episode of an attempt world was."""
         bank, motion = self.bank, episode.motion
         scene = self.scenes[motion]
-        qpos = episode.steps["qpos"].astype(np.float64)
+        steps = {name: _float64(rows) for name, rows in episode.steps.items()}
+        qpos = steps["qpos"]
         rows = torch.full((len(qpos),), motion)
         frames = torch.arange(episode.frame - len(qpos), episode.frame) + 1
         ref = bank.at(rows, frames)
         ref_links = bank.at(rows, frames, ("link_pos",))["link_pos"]
-        kin = self._kinematics(scene, qpos)
+        kin = self.kinematics(self._hand_joints(scene, qpos), None)
         hand = torch.arange(2).unsqueeze(-1)
         has, slot = bank.has_object[motion], bank.hand_slot[motion]
         rollout = Rollout(
+            **self._of_run,
             motion=bank.names[motion],
-            hand=self.hand,
-            fps=bank.fps,
-            decimation=self.decimation,
-            grace=grace_steps(bank.fps),
-            qpos0=episode.qpos0.astype(np.float64),
-            qvel0=episode.qvel0.astype(np.float64),
-            ctrl=episode.steps["ctrl"].astype(np.float64),
+            qpos0=_float64(episode.qpos0),
+            qvel0=_float64(episode.qvel0),
+            ctrl=steps["ctrl"],
             qpos=qpos,
-            qvel=episode.steps["qvel"].astype(np.float64),
+            qvel=steps["qvel"],
+            wrench=steps["wrench"],
+            actions=episode.steps["action"],
             **_objects(scene, qpos, (bank.object_index[motion] >= 0).tolist()),
-            ref_object_pos=ref["object_pos"].double().numpy(),
-            ref_object_quat=ref["object_quat"].double().numpy(),
-            fingertips=kin["tip_pos"].double().numpy(),
-            ref_fingertips=ref["tip_pos"].double().numpy(),
-            joints=kin["link_pos"][:, hand, self._links].double().numpy(),
-            ref_joints=ref_links[:, hand, self._keypoints].double().numpy(),
+            ref_object_pos=_float64(ref["object_pos"]),
+            ref_object_quat=_float64(ref["object_quat"]),
+            fingertips=_float64(kin["tip_pos"]),
+            ref_fingertips=_float64(ref["tip_pos"]),
+            joints=_float64(kin["link_pos"][:, hand, self._links]),
+            ref_joints=_float64(ref_links[:, hand, self._keypoints]),
             hand_active=bank.hand_active[motion].numpy(),
             hand_object=torch.where(has, slot, -1).numpy(),
-            joint_bodies=self._bodies,
             model_xml=scene.xml,
-            criterion=self.criterion,
             errors="{}",
-            versions=self.made_by,
-            seed=self.seed,
             env_steps=episode.env_steps,
-            actions=episode.steps["action"],
             num_ref_frames=int(bank.length[motion]) - 1,
-            wrench=episode.steps["wrench"].astype(np.float64),
-            provenance=self.provenance,
         )
         rollout.terminations = [
             {"cause": name, "hand": side}
@@ -123,11 +118,11 @@ class RolloutBuilder:
         ]
         return rollout
 
-    def _kinematics(self, scene: Scene, qpos: np.ndarray) -> TensorDictBase:
+    def _hand_joints(self, scene: Scene, qpos: np.ndarray) -> torch.Tensor:
         joints = np.zeros((len(qpos), 2, self.bank.num_joints), np.float32)
         for side in scene.layout.sides:
             joints[:, keys.SIDES.index(side)] = qpos[:, scene.joint_qpos(side)]
-        return self.kinematics(torch.from_numpy(joints), None)
+        return torch.from_numpy(joints)
 
 
 def _objects(scene: Scene, qpos: np.ndarray, present: list[bool]) -> dict[str, Any]:
@@ -147,3 +142,7 @@ def _objects(scene: Scene, qpos: np.ndarray, present: list[bool]) -> dict[str, A
         "object_qpos_adr": qpos_adr,
         "object_qvel_adr": dof_adr,
     }
+
+
+def _float64(values: Any) -> np.ndarray:
+    return np.asarray(values, dtype=np.float64)

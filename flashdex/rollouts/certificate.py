@@ -16,9 +16,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
 from flashdex.rollouts.resimulation import (
+    PERTURBATION,
     Perturbation,
     Replay,
     Simulation,
@@ -41,6 +42,7 @@ PROVEN = ("certified", "robust")  # verdicts of a conversion that holds
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
 # mm; the scored object positions and the stored states are copies of one another
 MISMATCH_MM = 1e-3
+BRIEF = ("state", "reason", "failing_frame", "values")  # of a perturbed verdict
 DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
 
 
@@ -75,7 +77,9 @@ class Certificate:
 
     def to_json(self) -> str:
         """JSON text; numbers that are not finite become null."""
-        return json.dumps(_finite(asdict(self)), indent=1, allow_nan=False)
+        text = json.dumps(asdict(self))
+        finite = json.loads(text, parse_constant=lambda _: None)
+        return json.dumps(finite, indent=1, allow_nan=False)
 
     def save(self, path: str | Path) -> Path:
         """Write the JSON in one piece, usually ``<motion>.certificate.json``."""
@@ -89,33 +93,22 @@ def certify(
     *,
     num_perturbations: int = 8,
     seed: int = 0,
-    sizes: Perturbation | None = None,
+    sizes: Perturbation = PERTURBATION,
 ) -> Certificate:
     """Replay a rollout nominally and perturbed, and score it by its own criterion.
 
     The same file gives the same certificate on the same versions and processor type.
 
-    Args:
-        rollout: what was stored.
-        num_perturbations: number of perturbed replays.
-        seed: of the perturbations.
-        sizes: of the perturbations.
-
     Example:
         >>> certify(Rollout.load("rollouts/lift.npz")).verdict  # doctest: +SKIP
         'robust'
     """
-    sizes = sizes or Perturbation()
     criterion = resolve_criterion(rollout.criterion)
     sim = load_simulation(rollout)
     monitor = SafetyMonitor(sim.model, sim.object_body)
     nominal = resimulate(sim, monitor=monitor)
-    verdicts = score(nominal.errors, grace=rollout.grace)
     runs = [
-        score(
-            resimulate(perturb(sim, sizes, seed=seed, index=index)).errors,
-            grace=rollout.grace,
-        )
+        resimulate(perturb(sim, sizes, seed=seed, index=index)).verdicts
         for index in range(num_perturbations)
     ]
     wrench = rollout.wrench
@@ -123,7 +116,7 @@ def certify(
     assists = assist_sources(sim.model, sim.object_body)
     deviation = _deviation(sim, nominal)
     verdict, reason = _decide(
-        verdicts[criterion],
+        nominal.verdicts[criterion],
         [run[criterion] for run in runs],
         is_assisted=bool(assists) or (stored_wrench or nominal.wrench_max) > 0,
         mismatch_mm=deviation["stored_mismatch_mm"],
@@ -141,7 +134,7 @@ def certify(
             "applied_wrench_max": nominal.wrench_max,
             "assist_sources": assists,
         },
-        nominal={name: v.to_dict() for name, v in verdicts.items()},
+        nominal={name: v.to_dict() for name, v in nominal.verdicts.items()},
         deviation=deviation,
         perturbed=_perturbed_part(runs, seed, sizes),
         safety={
@@ -245,31 +238,12 @@ def _perturbed_part(
         "sizes": asdict(sizes),
         "counts": counts,
         "pass_fraction": {
-            name: _fraction(count["passed"], count["failed"])
+            name: count["passed"] / measured if measured else None
             for name, count in counts.items()
+            for measured in [count["passed"] + count["failed"]]
         },
-        "runs": [{name: _brief(v) for name, v in run.items()} for run in runs],
+        "runs": [
+            {name: {k: getattr(v, k) for k in BRIEF} for name, v in run.items()}
+            for run in runs
+        ],
     }
-
-
-def _fraction(passed: int, failed: int) -> float | None:
-    return passed / (passed + failed) if passed + failed else None
-
-
-def _brief(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "state": verdict.state,
-        "reason": verdict.reason,
-        "failing_frame": verdict.failing_frame,
-        "values": dict(verdict.values),
-    }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

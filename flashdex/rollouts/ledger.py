@@ -29,7 +29,7 @@ class Ledger:
         run_dir: run directory.
         names: motions of the collection.
         criterion: what counts as a conversion.
-        seed: of the run.
+        seed: of the run, for the lines.
         engine: physics engine of the rollouts.
         on_gpu: a GPU steps the physics, so that its seconds count.
         certify: replay conversions and write the certificate.
@@ -96,14 +96,7 @@ class Ledger:
         return line, self.count(line)
 
     def count(self, line: dict[str, Any]) -> bool:
-        """Count a line that is in the file, written here or by another process.
-
-        Args:
-            line: of one attempt.
-
-        Returns:
-            Whether it is the motion's first that passes.
-        """
+        """Count a line that is in the file; is it the motion's first that passes?"""
         name = line["motion"]
         self.attempts[name] = self.attempts.get(name, 0) + 1
         self.last[name] = line["converted"]
@@ -144,18 +137,17 @@ class Ledger:
         Returns:
             Motions whose lines were written.
         """
-        told = {
-            line["rollout"]: line["env_steps"]
-            for line in read_lines(self.path)
-            if line.get("rollout")
-        }
+        lines = read_lines(self.path)
+        told = {x["rollout"]: x["env_steps"] for x in lines if x.get("rollout")}
         out = []
         for name in self.names:
             path = self.rollouts / f"{name}.npz"
             if not path.is_file():
                 continue
+            with np.load(path, allow_pickle=False) as file:
+                made_at = int(file["env_steps"])
             # A later pass replaces the file of an unproven one: compare when it was.
-            if told.get(f"{ROLLOUTS}/{path.name}") == _env_steps(path):
+            if told.get(f"{ROLLOUTS}/{path.name}") == made_at:
                 continue
             rollout = Rollout.load(path)
             if rollout.score()[self.criterion].is_passed:
@@ -189,29 +181,19 @@ class Ledger:
         """Converted motions whose certificate holds."""
         return sum(bool(c["certified"]) for c in self.conversions.values())
 
-    @property
-    def num_robust(self) -> int:
-        """Converted motions whose certificate holds under disturbances too."""
-        return sum(c.get("verdict") == "robust" for c in self.conversions.values())
-
     def metrics(self, hours: float) -> dict[str, float]:
         """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
         passing = sum(self.last.get(n, False) for n in self.names)
+        robust = sum(c.get("verdict") == "robust" for c in self.conversions.values())
         out = {
             "convert/cumulative": float(self.num_converted),
             "convert/rate": self.num_converted / total,
             "convert/last": passing / total,
             "convert/certified": float(self.num_certified),
-            "convert/robust": float(self.num_robust),
+            "convert/robust": float(robust),
             "convert/attempts": float(self.num_attempts),
         }
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours
         return out
-
-
-def _env_steps(path: Path) -> int:
-    """When a stored rollout was made; reads nothing else of the file."""
-    with np.load(path, allow_pickle=False) as file:
-        return int(file["env_steps"])

@@ -22,27 +22,16 @@ CAUSE = "cause/"
 
 @dataclass(frozen=True)
 class Episode:
-    """One finished episode of T steps, as recorded.
+    """One finished episode of T steps of a world, as recorded."""
 
-    Attributes:
-        env: world.
-        env_steps: counter of the run at its last step.
-        steps: rows after each step, (T, ...): qpos, qvel, ctrl, wrench, action.
-        qpos0: state that it began from, (nq,).
-        qvel0: (nv,).
-        motion: motion row.
-        frame: reference frame that the last step was scored on.
-        causes: termination -> which hand was blamed for the end, (2,) bool.
-    """
-
-    env: int
-    env_steps: int
-    steps: dict[str, np.ndarray]
-    qpos0: np.ndarray
-    qvel0: np.ndarray
-    motion: int
-    frame: int
-    causes: dict[str, list[bool]]
+    env: int  # world
+    env_steps: int  # counter of the run at the last step
+    steps: dict[str, np.ndarray]  # qpos, qvel, ctrl, wrench, action AFTER it, (T, ...)
+    qpos0: np.ndarray  # state that it began from, (nq,)
+    qvel0: np.ndarray  # (nv,)
+    motion: int  # row of the motion
+    frame: int  # reference frame that the last step was scored on
+    causes: dict[str, list[bool]]  # termination -> hands blamed for the end, (2,)
 
 
 class EpisodeRecorder:
@@ -71,8 +60,7 @@ class EpisodeRecorder:
     def record_start(self) -> None:
         """Keep the state that the coming step starts from."""
         raw = self.env.physics.raw()
-        self._write("qpos0", raw.qpos)
-        self._write("qvel0", raw.qvel)
+        self._write(qpos0=raw.qpos, qvel0=raw.qvel)
 
     def record_step(
         self, action: Tensor, done: Tensor, env_steps: int
@@ -89,14 +77,18 @@ class EpisodeRecorder:
         """
         info, raw = self.env.info, self.env.physics.raw()
         assert info is not None
-        state = (raw.qpos, raw.qvel, raw.ctrl, raw.wrench, action)
-        for name, values in zip(STEPS, state, strict=True):
-            self._write(name, values)
-        self._write("motion", info.motion)
-        self._write("frame", info.frame)
-        self._write("done", done)
-        for name, blame in info.outcome.causes.items():
-            self._write(CAUSE + name, blame)
+        causes = {CAUSE + name: blame for name, blame in info.outcome.causes.items()}
+        self._write(
+            qpos=raw.qpos,
+            qvel=raw.qvel,
+            ctrl=raw.ctrl,
+            wrench=raw.wrench,
+            action=action,
+            motion=info.motion,
+            frame=info.frame,
+            done=done,
+            **causes,
+        )
         self.written += 1
         self._env_steps.append(env_steps)
         return self.finished() if len(self._env_steps) == self.look_every else []
@@ -118,14 +110,13 @@ class EpisodeRecorder:
     def _columns(self, first: int, stop: int) -> Tensor:
         return (torch.arange(first, stop) % self.size).to(self.env.device)
 
-    def _write(self, name: str, values: Tensor) -> None:
-        values = values[: self.count]
-        if name not in self._rings:
-            shape = (self.count, self.size, *values.shape[1:])
-            self._rings[name] = torch.zeros(
-                shape, dtype=values.dtype, device=self.env.device
-            )
-        self._rings[name][:, self.written % self.size] = values
+    def _write(self, **rows: Tensor) -> None:
+        for name, values in rows.items():
+            if name not in self._rings:
+                shape = (self.count, self.size, *values.shape[1:])
+                ring = torch.zeros(shape, dtype=values.dtype, device=self.env.device)
+                self._rings[name] = ring
+            self._rings[name][:, self.written % self.size] = values[: self.count]
 
     def _take(self, env: int, first: int, last: int, env_steps: int) -> Episode:
         columns = self._columns(first, last + 1)

@@ -17,19 +17,17 @@ import numpy as np
 
 from flashdex.errors import RunError
 from flashdex.keys import FINGERS, SIDES
+from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import TrackingErrors
 from flashdex.rollouts.rollout import Rollout
 
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200
 # MuJoCo goes on after these, with contacts dropped or controls set to zero
-NUMERIC_WARNINGS = (
-    "mjWARN_CONTACTFULL",
-    "mjWARN_CNSTRFULL",
-    "mjWARN_BADCTRL",
-    "mjWARN_BADQPOS",
-    "mjWARN_BADQVEL",
-    "mjWARN_BADQACC",
+NUMERIC_WARNINGS = tuple(
+    f"mjWARN_{what}"
+    for what in ("CONTACTFULL", "CNSTRFULL", "BADCTRL", "BADQPOS", "BADQVEL", "BADQACC")
 )
 
 StepMonitor = Callable[[mujoco.MjModel, mujoco.MjData], None]
@@ -37,48 +35,29 @@ StepMonitor = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
 @dataclass(frozen=True)
 class Simulation:
-    """What a rollout is replayed with, and where its parts are in the model.
+    """What a rollout is replayed with, and where its parts are in the model (or -1)."""
 
-    Attributes:
-        rollout: reference, first velocities, masks.
-        model: compiled model.
-        qpos0: first positions, (nq,).
-        ctrl: position targets, (T, nu).
-        object_body: body of each object slot, -1 when empty, (O,).
-        object_adr: qpos address of each slot, -1 when empty, (O,).
-        pad_sites: fingertip sites, (2, 5), -1 when absent.
-        joint_bodies: bodies of ``joints``, (2, M), -1 when absent.
-        wrist_bodies: (2,), -1 when absent.
-    """
-
-    rollout: Rollout
+    rollout: Rollout  # reference, first velocities, masks
     model: mujoco.MjModel
-    qpos0: np.ndarray
-    ctrl: np.ndarray
-    object_body: np.ndarray
-    object_adr: np.ndarray
-    pad_sites: np.ndarray
-    joint_bodies: np.ndarray
-    wrist_bodies: np.ndarray
+    qpos0: np.ndarray  # first positions, (nq,)
+    ctrl: np.ndarray  # position targets, (T, nu)
+    object_body: np.ndarray  # body of each object slot, (O,)
+    object_adr: np.ndarray  # qpos address of each object slot, (O,)
+    pad_sites: np.ndarray  # fingertip sites, (2, 5)
+    joint_bodies: np.ndarray  # bodies of ``joints``, (2, M)
+    wrist_bodies: np.ndarray  # (2,)
 
 
 @dataclass(frozen=True)
 class Replay:
-    """States and counts of one open-loop replay; world, m, rad, wxyz.
+    """States and counts of one open-loop replay; world, m, rad, wxyz."""
 
-    Attributes:
-        qpos: after each control step, (T, nq).
-        errors: against the rollout's reference.
-        warnings: MuJoCo warning -> times raised.
-        nan_count: values of the states that are not finite.
-        wrench_max: largest applied force or torque seen, N or N m.
-    """
-
-    qpos: np.ndarray
-    errors: TrackingErrors
-    warnings: dict[str, int]
-    nan_count: int
-    wrench_max: float
+    qpos: np.ndarray  # after each control step, (T, nq)
+    errors: TrackingErrors  # against the rollout's reference
+    verdicts: dict[str, Verdict]  # of every criterion
+    warnings: dict[str, int]  # MuJoCo warning -> times raised
+    nan_count: int  # values of the states that are not finite
+    wrench_max: float  # largest applied force or torque seen, N or N m
 
 
 def load_simulation(rollout: Rollout) -> Simulation:
@@ -208,7 +187,8 @@ def resimulate(sim: Simulation, *, monitor: StepMonitor | None = None) -> Replay
     overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
     states = {**_tracked_points(sim, qpos), **_object_poses(sim, qpos)}
     errors = rollout.errors_of(states, overflow=overflow)
-    return Replay(qpos, errors, warnings, nan_count, wrench_max)
+    verdicts = score(errors, grace=rollout.grace)
+    return Replay(qpos, errors, verdicts, warnings, nan_count, wrench_max)
 
 
 def _tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
@@ -246,30 +226,24 @@ def _object_poses(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | N
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Sizes of the disturbances; they are part of the certificate's schema.
+    """Sizes of the disturbances; they are part of the certificate's schema."""
 
-    Attributes:
-        object_pos: first object position, uniform per axis, m.
-        object_rot: first object turn about a random axis, uniform, rad.
-        mass: object mass and inertia factor, uniform.
-        friction: factor of all friction, uniform.
-        ctrl_noise: standard deviation of normal noise, share of the actuator's range.
-        ctrl_range_m: a slide's range counts at most as this much, m: a wrist that may
-            travel metres would else be shaken by centimetres.
-        ctrl_range_rad: the same for hinges, rad.
-    """
-
-    object_pos: float = 2e-3
-    object_rot: float = float(np.radians(2.0))
-    mass: tuple[float, float] = (0.8, 1.2)
-    friction: tuple[float, float] = (0.8, 1.2)
-    ctrl_noise: float = 5e-3
+    object_pos: float = 2e-3  # first position, uniform per axis, m
+    object_rot: float = float(np.radians(2.0))  # about a random axis, uniform, rad
+    mass: tuple[float, float] = (0.8, 1.2)  # factor of mass and inertia, uniform
+    friction: tuple[float, float] = (0.8, 1.2)  # factor of all friction, uniform
+    ctrl_noise: float = 5e-3  # normal, std as a share of the actuator's range
+    # a slide's range counts at most as this much, m: a wrist that may travel metres
+    # would else be shaken by centimetres; the same for hinges, rad
     ctrl_range_m: float = 0.4
     ctrl_range_rad: float = float(np.pi)
 
 
+PERTURBATION = Perturbation()
+
+
 def perturb(
-    sim: Simulation, sizes: Perturbation | None = None, *, seed: int, index: int
+    sim: Simulation, sizes: Perturbation = PERTURBATION, *, seed: int, index: int
 ) -> Simulation:
     """The same rollout, a little disturbed: what a robust conversion survives.
 
@@ -279,7 +253,6 @@ def perturb(
         seed: of the certificate.
         index: number of the perturbed replay.
     """
-    sizes = sizes or Perturbation()
     rng = np.random.default_rng([seed, index])
     model = _perturb_model(sim, rng, sizes)
     qpos0 = perturb_objects(sim, rng, sizes)
@@ -326,15 +299,10 @@ def perturb_objects(
 def control_range(
     model: mujoco.MjModel, ctrl: np.ndarray, sizes: Perturbation
 ) -> np.ndarray:
-    """Range of each actuator: its own, else its joint's, else the span it was used in.
-
-    Args:
-        model: compiled model.
-        ctrl: controls of the rollout, (T, nu).
-        sizes: caps.
+    """Range of each actuator: its own, else its joint's, else the span of ctrl (T, nu).
 
     Returns:
-        m or rad, (nu,).
+        m or rad, at most the caps of ``sizes``, (nu,).
     """
     width = np.ptp(ctrl, axis=0)
     for i in range(model.nu):

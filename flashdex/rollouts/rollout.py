@@ -34,34 +34,8 @@ class Rollout:
     ``decimation`` substeps, the states are those AFTER it, and ``ref_*[t]`` is the
     reference it is scored on. World frame, metres, radians, quaternions wxyz.
 
-    Shapes stand beside the fields: T control steps, O object slots, M joints of the
-    criteria, 2 hands [left, right], 5 fingers [thumb, ..., pinky].
-
-    Args:
-        motion: motion id.
-        hand: name of the hand model.
-        fps: control rate, Hz.
-        decimation: substeps a control step.
-        grace: first steps that the ManipTrans family does not score.
-        qpos0: first state.
-        ctrl: position targets.
-        fingertips: pad points of the robot; ``ref_fingertips`` are the human tips.
-        joints: level-1 links, then distal links; ``ref_joints`` the human joints.
-        hand_object: object slot of each hand, -1 without object.
-        object_qpos_adr: address of each free joint, -1 for an empty slot.
-        joint_bodies: JSON, per hand the M body names behind ``joints``.
-        model_xml: self-contained MJCF.
-        criterion: name of the criterion the rollout was stored for.
-        errors: JSON, numbers of that criterion.
-        versions: JSON, package versions and the engine that produced the states.
-        env_steps: env steps of the run at which the rollout was made.
-        actions: policy outputs.
-        model_sha256: hash of ``model_xml``; computed when empty.
-        num_ref_frames: length of the whole reference, -1 when it is T.
-        wrist_bodies: JSON, the two body names behind ``wrist_pos``, or empty.
-        act0: first actuator state, or None for zeros.
-        wrench: assist force and torque on each object, or None.
-        provenance: JSON: recipe hash, collection hash, checkpoint hash, date, hardware.
+    T control steps, O object slots, M joints of the criteria, 2 hands [left, right], 5
+    fingers [thumb, index, middle, ring, pinky].
 
     Attributes:
         terminations: what ended the attempt early, ``cause`` and ``hand`` of each. The
@@ -73,43 +47,43 @@ class Rollout:
     """
 
     motion: str
-    hand: str
-    fps: float
-    decimation: int
-    grace: int
+    hand: str  # name of the hand model
+    fps: float  # control rate, Hz
+    decimation: int  # substeps a control step
+    grace: int  # first steps that the ManipTrans family does not score
     qpos0: Annotated[np.ndarray, "nq"]
     qvel0: Annotated[np.ndarray, "nv"]
-    ctrl: Annotated[np.ndarray, "T nu"]
+    ctrl: Annotated[np.ndarray, "T nu"]  # position targets
     qpos: Annotated[np.ndarray, "T nq"]
     qvel: Annotated[np.ndarray, "T nv"]
-    object_pos: Annotated[np.ndarray, "T O 3"]
+    object_pos: Annotated[np.ndarray, "T O 3"]  # object frames
     object_quat: Annotated[np.ndarray, "T O 4"]
     ref_object_pos: Annotated[np.ndarray, "T O 3"]
     ref_object_quat: Annotated[np.ndarray, "T O 4"]
-    fingertips: Annotated[np.ndarray, "T 2 5 3"]
-    ref_fingertips: Annotated[np.ndarray, "T 2 5 3"]
-    joints: Annotated[np.ndarray, "T 2 M 3"]
-    ref_joints: Annotated[np.ndarray, "T 2 M 3"]
-    hand_active: Annotated[np.ndarray, "2"]
-    hand_object: Annotated[np.ndarray, "2"]
-    object_qpos_adr: Annotated[np.ndarray, "O"]
+    fingertips: Annotated[np.ndarray, "T 2 5 3"]  # pad points
+    ref_fingertips: Annotated[np.ndarray, "T 2 5 3"]  # human tips
+    joints: Annotated[np.ndarray, "T 2 M 3"]  # level-1 links, then distal links
+    ref_joints: Annotated[np.ndarray, "T 2 M 3"]  # human joints in the same order
+    hand_active: Annotated[np.ndarray, "2"]  # hands that take part
+    hand_object: Annotated[np.ndarray, "2"]  # object slot, -1 without object
+    object_qpos_adr: Annotated[np.ndarray, "O"]  # of the free joint, -1: empty slot
     object_qvel_adr: Annotated[np.ndarray, "O"]
-    joint_bodies: str
-    model_xml: str
-    criterion: str
-    errors: str
-    versions: str
-    seed: int
-    env_steps: int
-    actions: Annotated[np.ndarray, "T 2 A"]
-    model_sha256: str = ""
-    num_ref_frames: int = -1
+    joint_bodies: str  # JSON, per hand the M body names behind joints
+    model_xml: str  # self-contained MJCF
+    criterion: str  # that the rollout was stored for
+    errors: str  # JSON, numbers of that criterion
+    versions: str  # JSON, of the packages and the engine that produced the states
+    seed: int  # of the run
+    env_steps: int  # of the run, when the rollout was made
+    actions: Annotated[np.ndarray, "T 2 A"]  # policy outputs
+    model_sha256: str = ""  # of model_xml; computed when empty
+    num_ref_frames: int = -1  # length of the whole reference, -1 when it is T
     wrist_pos: Annotated[np.ndarray | None, "T 2 3"] = None
     ref_wrist_pos: Annotated[np.ndarray | None, "T 2 3"] = None
-    wrist_bodies: str = ""
-    act0: Annotated[np.ndarray | None, "na"] = None
-    wrench: Annotated[np.ndarray | None, "T O 6"] = None
-    provenance: str = "{}"
+    wrist_bodies: str = ""  # JSON, the two body names behind wrist_pos, or empty
+    act0: Annotated[np.ndarray | None, "na"] = None  # first actuator state; None: 0
+    wrench: Annotated[np.ndarray | None, "T O 6"] = None  # assist force and torque
+    provenance: str = "{}"  # JSON: hashes of recipe, library, checkpoint; date
 
     def __post_init__(self) -> None:
         self.terminations: list[dict[str, str]] = []
@@ -176,7 +150,6 @@ class Rollout:
         """
         verdicts = self.score(completed=self.completed)
         verdict = verdicts[criterion]
-        active = zip(SIDES, self.hand_active, strict=True)
         return {
             "motion": self.motion,
             "converted": verdict.is_passed,
@@ -185,7 +158,7 @@ class Rollout:
             "errors": {k: round(v, 6) for k, v in verdict.values.items()},
             "passed": [name for name, v in verdicts.items() if v.is_passed],
             "completed": self.completed,
-            "hands": [side for side, is_active in active if is_active],
+            "hands": [SIDES[hand] for hand in np.flatnonzero(self.hand_active)],
             "why": self.terminations or _why(verdict),
             "frame": self.num_frames,
             "env_steps": self.env_steps,
@@ -203,7 +176,12 @@ class Rollout:
             if get_origin(hint) is Annotated and value is not None:
                 _check_shape(key, value, hint.__metadata__[0], sizes, where)
         for key in ("joint_bodies", "errors", "versions", "provenance", "wrist_bodies"):
-            _check_json(key, getattr(self, key), where)
+            text = getattr(self, key)
+            try:
+                if text or key != "wrist_bodies":  # which may be empty
+                    json.loads(text)
+            except json.JSONDecodeError as error:
+                raise RunError(f"{where}: {key} is not JSON ({error}).") from error
         if self.model_sha256 != _sha256(self.model_xml):
             raise RunError(
                 f"{where}: model_sha256 does not match model_xml: the model was "
@@ -237,7 +215,7 @@ class Rollout:
                 f"{path}: missing keys {', '.join(absent)}. A rollout holds "
                 f"{', '.join(sorted(required))}. Store the rollout again."
             )
-        values = {
+        values: dict[str, Any] = {
             key: data[key] if get_origin(hint) is Annotated else hint(data[key])
             for key, hint in _hints().items()
             if key in data
@@ -304,12 +282,3 @@ def _check_shape(
             f"{where}: {key} has shape {shape}, expected ({symbols})"
             f"{' with ' + known if known else ''}. Store the rollout again."
         )
-
-
-def _check_json(key: str, text: str, where: str) -> None:
-    if not text and key == "wrist_bodies":
-        return
-    try:
-        json.loads(text)
-    except json.JSONDecodeError as error:
-        raise RunError(f"{where}: {key} is not JSON ({error}).") from error

@@ -16,7 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -31,72 +31,25 @@ if TYPE_CHECKING:
 MAX_PENDING = 512  # episodes in line, a megabyte each; then the loop waits
 
 
-class Scorer(Protocol):
-    """Takes episodes in and says which motions converted, in the order of episodes."""
-
-    @property
-    def pending(self) -> int:
-        """Episodes that are not scored yet."""
-        ...
-
-    def submit(self, episode: Episode, wall_s: float) -> None:
-        """Hand over one finished episode.
-
-        Args:
-            episode: of an attempt world.
-            wall_s: seconds of the run.
-        """
-        ...
-
-    def collect(self, *, wait: bool = False) -> list[str]:
-        """Motions whose first passing attempt was found since the last call.
-
-        Args:
-            wait: until all episodes are scored and their lines written.
-
-        Raises:
-            OSError: a file could not be written.
-            RunError: the scoring process has died.
-        """
-        ...
-
-    def close(self, *, wait: bool = True) -> None:
-        """End.
-
-        Args:
-            wait: score what is in line first.
-        """
-        ...
-
-
 class InlineScorer:
-    """Scores at once.
+    """Scores at once."""
 
-    Args:
-        ledger: writes the lines.
-        builder: builds the rollouts.
-    """
-
-    pending = 0
+    pending = 0  # episodes that are not scored yet
 
     def __init__(self, ledger: Ledger, builder: RolloutBuilder) -> None:
         self.ledger, self.builder = ledger, builder
         self._converted: list[str] = []
 
-    def score(self, episode: Episode, wall_s: float) -> dict[str, Any]:
-        """Score one episode; return its line, which is in the file."""
+    def submit(self, episode: Episode, wall_s: float) -> dict[str, Any]:
+        """Score a finished episode at so many seconds of the run; return its line."""
         rollout = self.builder.build(episode)
         line, is_first = self.ledger.record(rollout, wall_s=wall_s)
         if is_first:
             self._converted.append(rollout.motion)
         return line
 
-    def submit(self, episode: Episode, wall_s: float) -> None:
-        """See ``Scorer.submit``."""
-        self.score(episode, wall_s)
-
     def collect(self, *, wait: bool = False) -> list[str]:
-        """See ``Scorer.collect``."""
+        """Motions whose first passing attempt was found since the last call."""
         converted, self._converted = self._converted, []
         return converted
 
@@ -106,23 +59,14 @@ class InlineScorer:
 
 @dataclass(frozen=True)
 class ScorerSpec:
-    """What the scoring process builds its own scorer from.
+    """What the scoring process builds its own scorer from."""
 
-    Attributes:
-        recipe: of the run, with the library that is in use.
-        run_dir: run directory.
-        made_by: engine, versions and hardware of the states.
-        provenance: stored with every rollout.
-        trivial: motions that a baseline already passes.
-        on_gpu: a GPU steps the physics.
-    """
-
-    recipe: Recipe
+    recipe: Recipe  # of the run, with the library that is in use
     run_dir: Path
-    made_by: dict[str, Any]
-    provenance: dict[str, str]
-    trivial: dict[str, list[str]]
-    on_gpu: bool = False
+    made_by: dict[str, Any]  # engine, versions and hardware of the states
+    provenance: dict[str, str]  # stored with every rollout
+    trivial: dict[str, list[str]]  # motions that a baseline already passes
+    on_gpu: bool = False  # a GPU steps the physics
 
 
 MakeScorer = Callable[[ScorerSpec], InlineScorer]
@@ -152,14 +96,22 @@ class ProcessScorer:
         return len(self._line)
 
     def submit(self, episode: Episode, wall_s: float) -> None:
-        """See ``Scorer.submit``."""
+        """Hand over a finished episode at so many seconds of the run."""
         try:
             self._line.append(self._pool.submit(_score, episode, wall_s))
         except BrokenProcessPool as error:
             raise self._died() from error
 
     def collect(self, *, wait: bool = False) -> list[str]:
-        """See ``Scorer.collect``."""
+        """Motions whose first passing attempt was found since the last call.
+
+        Args:
+            wait: until all episodes are scored and their lines written.
+
+        Raises:
+            OSError: a file could not be written.
+            RunError: the scoring process has died.
+        """
         converted = []
         enough = 0 if wait else MAX_PENDING
         while self._line and (len(self._line) > enough or self._line[0].done()):
@@ -185,13 +137,16 @@ class ProcessScorer:
         )
 
     def close(self, *, wait: bool = True) -> None:
-        """See ``Scorer.close``."""
+        """End; ``wait`` to score what is in line first."""
         try:
             if wait:
                 self.collect(wait=True)
         finally:
             self._pool.shutdown(wait=wait, cancel_futures=True)
 
+
+Scorer = InlineScorer | ProcessScorer
+"""Takes episodes in and says which motions converted, in the order of episodes."""
 
 _opened: list[InlineScorer] = []  # of the scoring process
 
@@ -221,4 +176,4 @@ def _open(spec: ScorerSpec, make: MakeScorer) -> None:
 
 
 def _score(episode: Episode, wall_s: float) -> dict[str, Any]:
-    return _opened[0].score(episode, wall_s)
+    return _opened[0].submit(episode, wall_s)

@@ -14,7 +14,7 @@ def turn_z(angle):
 
 @pytest.fixture
 def poses():
-    """Build tracking errors of moving objects whose errors are given, one column a slot."""
+    """Build tracking errors of moving objects: those given, one column a slot."""
 
     def build(
         pos_error, rot_error=None, *, moving=None, tips=None, joints=None, **masks

@@ -93,7 +93,7 @@ def test_looking_seldom_finds_the_same_episodes(make_env):
     for number, (action, done) in enumerate(random_steps(env, 200)):
         if action is None:
             continue
-        # the state before the step is the one after the restart: record_start comes first
+        # the state before the step is the one after the restart: the start comes first
         one += often.record_step(action, done, number)
         other += seldom.record_step(action, done, number)
         for recorder in (often, seldom):

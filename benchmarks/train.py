@@ -159,7 +159,7 @@ def _restart(trainer: Trainer) -> TensorDictBase:
     if forget is not None:
         forget()
     td = trainer.env.reset()
-    trainer.attempts.begin()
+    trainer.recorder.record_start()
     return td
 
 

@@ -124,7 +124,7 @@ def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], flo
                 yield trainer, described, timer() - begin
         finally:
             trainer.alongside.close()
-            trainer.judging.close(wait=False)
+            trainer.scorer.close(wait=False)
             trainer.log.close()
 
 
@@ -143,7 +143,7 @@ def _restart(trainer: Trainer) -> TensorDictBase:
     if forget is not None:
         forget()
     td = trainer.env.reset()
-    trainer.attempts.begin()
+    trainer.recorder.record_start()
     return td
 
 

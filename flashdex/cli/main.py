@@ -259,14 +259,10 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _score(args: argparse.Namespace) -> int:
-    from flashdex.metrics.criteria import score
     from flashdex.reports.run.terminal import score_table
     from flashdex.rollouts.rollout import Rollout
 
-    found = {}
-    for path in args.files:
-        rollout = Rollout.load(path)
-        found[str(path)] = score(rollout.signals(), grace=rollout.grace)
+    found = {str(path): Rollout.load(path).score() for path in args.files}
     if args.json:
         plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
         print(json.dumps(plain, indent=1))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from flashdex.metrics.criteria_table import State, Verdict
-from flashdex.metrics.errors import Signals
+from flashdex.metrics.errors import TrackingErrors
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,18 @@ class MeanErrors:
     rot: float  # rad
 
 
-def mean_object_errors(signals: Signals, *, grace: int = 0) -> MeanErrors | None:
+def mean_object_errors(errors: TrackingErrors, *, grace: int = 0) -> MeanErrors | None:
     """Mean object errors of one rollout; None if they cannot be measured.
 
     A shared object counts once per hand, as everywhere; the first ``grace`` steps are
     left out.
     """
-    pos, rot = signals.object_pos_error, signals.object_rot_error
-    if pos is None or rot is None or not signals.slots or not signals.is_finite:
+    pos, rot = errors.object_pos_error, errors.object_rot_error
+    if pos is None or rot is None or not errors.slots or not errors.is_finite:
         return None
-    if signals.num_frames <= grace:
+    if errors.num_frames <= grace:
         return None
-    pos, rot = (error[grace:, signals.slots].mean() for error in (pos, rot))
+    pos, rot = (error[grace:, errors.slots].mean() for error in (pos, rot))
     return MeanErrors(float(pos), float(rot))
 
 

@@ -23,28 +23,32 @@ from flashdex.metrics.criteria_table import (
     make_criteria,
     resolve_criterion,
 )
-from flashdex.metrics.errors import Signals, centred_position_error, reference_drift
+from flashdex.metrics.errors import (
+    TrackingErrors,
+    centred_position_error,
+    reference_drift,
+)
 
 __all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "score"]
 
 STATIC_DRIFT = 1e-3  # m; a reference that moves less on average counts as static
 
 
-def _series(signals: Signals, term: Term, side: int, grace: int) -> Tensor | str:
-    """One hand's signal over the scored window, (T - grace,), or what is missing."""
+def _series(errors: TrackingErrors, term: Term, side: int, grace: int) -> Tensor | str:
+    """One hand's error over the scored window, (T - grace,), or what is missing."""
     source = {
-        "object_pos": ("object_pos", signals.object_pos_error),
-        "object_pos_centred": ("object_pos", signals.object_pos_offset),
-        "object_rot": ("object_quat", signals.object_rot_error),
-        "fingertip": ("fingertips", signals.fingertip_error),
-        "joint": ("joints", signals.joint_error),
-        "wrist_pos": ("wrist_pos", signals.wrist_pos_error),
+        "object_pos": ("object_pos", errors.object_pos_error),
+        "object_pos_centred": ("object_pos", errors.object_pos_offset),
+        "object_rot": ("object_quat", errors.object_rot_error),
+        "fingertip": ("fingertips", errors.fingertip_error),
+        "joint": ("joints", errors.joint_error),
+        "wrist_pos": ("wrist_pos", errors.wrist_pos_error),
     }
     key, value = source[term.quantity]
     if value is None:
-        return f"missing:{signals.missing.get(key, key)}"
+        return f"missing:{errors.missing.get(key, key)}"
     is_object = term.quantity.startswith("object")
-    window = value[grace:, signals.hand_object[side] if is_object else side]
+    window = value[grace:, errors.hand_object[side] if is_object else side]
     if term.quantity == "object_pos_centred":
         return centred_position_error(window)
     return window.mean(-1) if term.quantity == "fingertip" else window
@@ -71,47 +75,50 @@ def _blame(term: Term, side: Side, series: Tensor, grace: int) -> Blame:
 
 
 def _object_sides(
-    signals: Signals, criterion: Criterion, sides: list[int]
+    errors: TrackingErrors, criterion: Criterion, sides: list[int]
 ) -> list[int]:
     """Hands whose object counts; some rules drop static references."""
-    chosen = [h for h in sides if signals.slot(h) >= 0]
-    if criterion.drop_static and signals.ref_object_pos is not None:
-        drift = reference_drift(signals.ref_object_pos)
-        chosen = [h for h in chosen if float(drift[signals.slot(h)]) >= STATIC_DRIFT]
+    chosen = [h for h in sides if errors.slot(h) >= 0]
+    if criterion.drop_static and errors.ref_object_pos is not None:
+        drift = reference_drift(errors.ref_object_pos)
+        chosen = [h for h in chosen if float(drift[errors.slot(h)]) >= STATIC_DRIFT]
     return chosen
 
 
 def _unmeasurable(
-    signals: Signals, criterion: Criterion, sides: list[int], completed: bool | None
+    errors: TrackingErrors,
+    criterion: Criterion,
+    sides: list[int],
+    completed: bool | None,
 ) -> str:
     """Why the criterion has no meaning on this file, or an empty string."""
-    if not [h for h in sides if signals.hand_active[h]]:
+    if not [h for h in sides if errors.hand_active[h]]:
         return "hand_absent"
     if criterion.family == "completed":
         return "missing:completed" if completed is None else ""
-    if not [h for h in sides if signals.slot(h) >= 0]:
+    if not [h for h in sides if errors.slot(h) >= 0]:
         return "no_object"
     for term in criterion.terms:
-        series = _series(signals, term, 0, 0)
+        series = _series(errors, term, 0, 0)
         if isinstance(series, str):
             return series
-    if not _object_sides(signals, criterion, sides):
+    if not _object_sides(errors, criterion, sides):
         return "static_reference"
     return ""
 
 
-def _judge(
-    signals: Signals, criterion: Criterion, sides: list[int]
+def _measure(
+    errors: TrackingErrors, criterion: Criterion, sides: list[int]
 ) -> tuple[dict[str, float], list[Blame]]:
     """Values that are compared with the limits, and who is beyond them."""
     values: dict[str, float] = {}
     blames: list[Blame] = []
-    hands = [h for h in sides if signals.hand_active[h]]
-    objects = _object_sides(signals, criterion, sides)
+    hands = [h for h in sides if errors.hand_active[h]]
+    objects = _object_sides(errors, criterion, sides)
     for term in criterion.terms:
         used = objects if term.quantity.startswith("object") else hands
         series = {
-            h: cast(Tensor, _series(signals, term, h, criterion.grace)) for h in used
+            h: cast(Tensor, _series(errors, term, h, criterion.grace)) for h in used
         }
         own = {h: _reduce_time(s, term.time) for h, s in series.items()}
         mean = sum(own.values()) / len(own)
@@ -125,7 +132,7 @@ def _judge(
 
 
 def _score_one(
-    signals: Signals,
+    errors: TrackingErrors,
     criterion: Criterion,
     name: str,
     sides: list[int],
@@ -133,22 +140,22 @@ def _score_one(
     partial: bool,
 ) -> Verdict:
     def short(state: State, reason: str = "") -> Verdict:
-        return Verdict(name, state, reason, fps=signals.fps)
+        return Verdict(name, state, reason, fps=errors.fps)
 
-    reason = _unmeasurable(signals, criterion, sides, completed)
+    reason = _unmeasurable(errors, criterion, sides, completed)
     if reason:
         return short("not_measured", reason)
-    if not signals.is_finite:
+    if not errors.is_finite:
         return short("failed", "numerics")
     if criterion.family == "completed":
         return short("passed") if completed else short("failed", "terminated")
-    is_short = signals.num_frames < signals.num_ref_frames - 1
+    is_short = errors.num_frames < errors.num_ref_frames - 1
     if is_short and not (partial and criterion.family == "spider"):
         return short("failed", "incomplete")
-    num_scored = signals.num_frames - criterion.grace
+    num_scored = errors.num_frames - criterion.grace
     if num_scored <= 0:
         return short("not_measured", "no_scored_frames")
-    values, blames = _judge(signals, criterion, sides)
+    values, blames = _measure(errors, criterion, sides)
     return Verdict(
         name,
         "failed" if blames else "passed",
@@ -158,12 +165,12 @@ def _score_one(
         tuple(blames),
         criterion.grace,
         num_scored,
-        signals.fps,
+        errors.fps,
     )
 
 
 def score(
-    signals: Signals,
+    errors: TrackingErrors,
     *,
     grace: int = 15,
     limits: Limits | None = None,
@@ -173,7 +180,7 @@ def score(
     """Score one rollout by every criterion, for both hands together and for each hand.
 
     Args:
-        signals: errors and masks of the rollout.
+        errors: errors and masks of the rollout.
         grace: first steps the ManipTrans family does not score.
         limits: other limits than the published ones.
         completed: the rollout reached the clip end under the training terminations;
@@ -186,7 +193,7 @@ def score(
     variants = {"": [0, 1], "_left": [0], "_right": [1]}
     return {
         c.name + suffix: _score_one(
-            signals, c, c.name + suffix, sides, completed, partial
+            errors, c, c.name + suffix, sides, completed, partial
         )
         for c in make_criteria(limits=limits, grace=grace)
         for suffix, sides in variants.items()

@@ -1,6 +1,6 @@
 """Every named success criterion as a row of one table.
 
-A criterion is a set of terms. A term takes one signal per hand, reduces it over the
+A criterion is a set of terms. A term takes one error per hand, reduces it over the
 scored frames, then over the hands, and compares it with a limit. ``criteria.score``
 applies the rows.
 """
@@ -43,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Term:
-    """One signal, its reductions over frames and hands, and its limit (m or rad)."""
+    """One error, its reductions over frames and hands, and its limit (m or rad)."""
 
     quantity: Quantity
     limit: float
@@ -156,10 +156,10 @@ class Blame:
     """One limit that one hand, or the object of one hand, crossed."""
 
     side: Side
-    term: str  # signal that was too large, e.g. ``object_pos``
+    term: str  # error that was too large, e.g. ``object_pos``
     value: float  # this hand's own, m or rad
     limit: float  # m or rad
-    frame: int  # first scored row at which the signal is beyond the limit, or -1
+    frame: int  # first scored row at which the error is beyond the limit, or -1
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Error signals between a rollout and its reference: the raw material of every score.
+"""Errors between a rollout and its reference: the raw material of every score.
 
 Row t of a rollout is the state AFTER control step t + 1; it is compared with row t of
 the reference the step was scored on. All arithmetic is float64, so that a constant
@@ -71,7 +71,7 @@ def align_to_reference(
 
 
 @dataclass(frozen=True)
-class Signals:
+class TrackingErrors:
     """Errors of one rollout and the masks that say which of them count.
 
     Frames are the T rows of the rollout; sides and `hand_active` are [left, right].
@@ -88,7 +88,9 @@ class Signals:
     num_frames: int  # T
     num_ref_frames: int  # T_ref, of the whole reference
     fps: float  # control rate, Hz
-    missing: Mapping[str, str] = field(default_factory=dict)  # signal -> absent key
+    missing: Mapping[str, str] = field(
+        default_factory=dict
+    )  # absent error -> key that was missing
     overflow: bool = False  # the engine dropped contacts or constraints
 
     @property
@@ -126,7 +128,7 @@ class Signals:
 def _pair(
     data: Mapping[str, Array | None], key: str, rows: Sequence[int]
 ) -> tuple[Tensor, Tensor] | str:
-    """A signal's simulated and reference array, or the key that is not usable."""
+    """Simulated and reference array of an error, or the key that is not usable."""
     pair = []
     for name in (key, f"ref_{key}"):
         value = data.get(name)
@@ -141,7 +143,7 @@ def _pair(
     return sim[:length], ref[:length]
 
 
-def compute_signals(
+def compute_tracking_errors(
     data: Mapping[str, Array | None],
     *,
     hand_active: Sequence[bool],
@@ -149,13 +151,13 @@ def compute_signals(
     fps: float = 60.0,
     num_ref_frames: int | None = None,
     overflow: bool = False,
-) -> Signals:
-    """Errors of one rollout against its reference, as :class:`Signals` defines them.
+) -> TrackingErrors:
+    """Errors of one rollout against its reference.
 
     Args:
         data: ``object_pos`` (T, O, 3), ``object_quat`` (T, O, 4) wxyz, ``fingertips``
             (T, 2, 5, 3), ``joints`` (T, 2, M, 3), ``wrist_pos`` (T, 2, 3), each with
-            its ``ref_`` twin; world, m. What is absent makes its signal None.
+            its ``ref_`` twin; world, m. What is absent makes its error None.
         hand_active: hands [left, right] that take part.
         hand_object: object slot of each hand, -1 without object.
         fps: control rate, Hz.
@@ -168,7 +170,7 @@ def compute_signals(
         ...     "object_quat": torch.tensor([1.0, 0, 0, 0]).expand(9, 1, 4),
         ... }
         >>> data = pose | {f"ref_{k}": v for k, v in pose.items()}
-        >>> compute_signals(
+        >>> compute_tracking_errors(
         ...     data, hand_active=(False, True), hand_object=(-1, 0)
         ... ).object_rot_error.max()
         tensor(0., dtype=torch.float64)
@@ -185,7 +187,7 @@ def compute_signals(
     pos = found.get("object_pos")
     lengths = {len(sim) for sim, _ in found.values()} or {0}
     if len(lengths) > 1:
-        raise ValueError(f"signals of different length: {sorted(lengths)}")
+        raise ValueError(f"errors of different length: {sorted(lengths)}")
     total = data.get("ref_object_pos")
     num_frames = lengths.pop()
     default_ref = num_frames if total is None else len(total)
@@ -193,7 +195,7 @@ def compute_signals(
     def error(key: str, distance: Callable[..., Tensor]) -> Tensor | None:
         return distance(*found[key]) if key in found else None
 
-    return Signals(
+    return TrackingErrors(
         object_pos_offset=None if pos is None else pos[0] - pos[1],
         object_rot_error=error("object_quat", quat_angle),
         ref_object_pos=None if pos is None else torch.as_tensor(total).double(),
@@ -217,11 +219,11 @@ def frozen_object(
     hand_active: Sequence[bool],
     hand_object: Sequence[int],
     fps: float = 60.0,
-) -> Signals:
-    """Signals of objects that stay at their first reference pose: pure arithmetic.
+) -> TrackingErrors:
+    """Errors of objects that stay at their first reference pose: pure arithmetic.
 
     Criteria with hand terms are not measured on it: there is no hand. Positions are
-    world, m, (T, O, 3), quaternions wxyz, (T, O, 4); the rest as in `compute_signals`.
+    world, m, (T, O, 3), quaternions wxyz, (T, O, 4); the rest as in `compute_tracking_errors`.
     """
     data = {
         "object_pos": ref_pos[:1].expand_as(ref_pos),
@@ -229,6 +231,6 @@ def frozen_object(
         "ref_object_pos": ref_pos,
         "ref_object_quat": ref_quat,
     }
-    return compute_signals(
+    return compute_tracking_errors(
         data, hand_active=hand_active, hand_object=hand_object, fps=fps
     )

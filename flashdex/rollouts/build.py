@@ -1,15 +1,12 @@
-"""From a recorded episode of an attempt world to a storable rollout."""
+"""From an episode of an attempt world to the rollout that is scored and stored."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
@@ -27,34 +24,15 @@ def grace_steps(fps: float) -> int:
     return round(GRACE_S * fps)
 
 
-@dataclass
-class Attempt:
-    """One finished episode of an attempt world.
-
-    Attributes:
-        rollout: everything the episode consisted of.
-        motion: motion row.
-        completed: reached the end of the motion without failure.
-        why: termination and hand that ended it, empty when completed.
-        frame: last frame it was scored on.
-    """
-
-    rollout: Rollout
-    motion: int
-    completed: bool
-    why: list[dict[str, str]]
-    frame: int
-
-
-class AttemptMaker:
-    """Turns recorded episodes into storable rollouts, on the cpu.
+class RolloutBuilder:
+    """Builds rollouts from recorded episodes, on the cpu.
 
     Args:
         bank: reference frames, on the cpu.
         hands: hand specs by side.
         scenes: scene of each motion.
         decimation: physics substeps of a control step.
-        criterion: what the rollouts are judged by.
+        criterion: what the rollouts are stored for.
         seed: of the run.
         made_by: engine, versions and hardware, from ``versions``.
         provenance: hashes of recipe and library, date; stored with every rollout.
@@ -72,127 +50,99 @@ class AttemptMaker:
         made_by: dict[str, Any],
         provenance: dict[str, str] | None = None,
     ) -> None:
-        self.bank, self.hands, self.scenes = bank, hands, scenes
+        self.bank, self.scenes = bank, scenes
         self.kinematics = HandKinematics(hands)
-        self.decimation, self.criterion, self.seed = decimation, criterion, seed
-        self.made_by = json.dumps(made_by)
-        self.provenance = json.dumps(provenance or {})
+        links, keypoints, bodies = [], [], []
+        for side in keys.SIDES:
+            hand = hands[side]
+            pairs = [*hand.level1_links, *hand.distal_links]
+            links.append([link for link, _ in pairs])
+            keypoints.append([hand.keypoint_links.index(pair) for pair in pairs])
+            bodies.append([hand.link_names[link] for link, _ in pairs])
+        # (2, M): links of ``joints``, and the rows of their human keypoints
+        self._links, self._keypoints = torch.tensor(links), torch.tensor(keypoints)
+        self._of_run: dict[str, Any] = {
+            "hand": hands["left"].name,
+            "fps": bank.fps,
+            "decimation": decimation,
+            "grace": grace_steps(bank.fps),
+            "criterion": criterion,
+            "versions": json.dumps(made_by),
+            "seed": seed,
+            "provenance": json.dumps(provenance or {}),
+            "joint_bodies": json.dumps(bodies),
+        }
 
-    def make(self, episode: Episode) -> Attempt:
-        """Return the attempt that an episode of an attempt world was."""
-        why = [
+    def build(self, episode: Episode) -> Rollout:
+        """The rollout that an episode of an attempt world was."""
+        bank, motion = self.bank, episode.motion
+        scene = self.scenes[motion]
+        steps = {name: _float64(rows) for name, rows in episode.steps.items()}
+        qpos = steps["qpos"]
+        rows = torch.full((len(qpos),), motion)
+        frames = torch.arange(episode.frame - len(qpos), episode.frame) + 1
+        ref = bank.at(rows, frames)
+        ref_links = bank.at(rows, frames, ("link_pos",))["link_pos"]
+        kin = self.kinematics(self._hand_joints(scene, qpos), None)
+        hand = torch.arange(2).unsqueeze(-1)
+        has, slot = bank.has_object[motion], bank.hand_slot[motion]
+        rollout = Rollout(
+            **self._of_run,
+            motion=bank.names[motion],
+            qpos0=_float64(episode.qpos0),
+            qvel0=_float64(episode.qvel0),
+            ctrl=steps["ctrl"],
+            qpos=qpos,
+            qvel=steps["qvel"],
+            wrench=steps["wrench"],
+            actions=episode.steps["action"],
+            **_objects(scene, qpos, (bank.object_index[motion] >= 0).tolist()),
+            ref_object_pos=_float64(ref["object_pos"]),
+            ref_object_quat=_float64(ref["object_quat"]),
+            fingertips=_float64(kin["tip_pos"]),
+            ref_fingertips=_float64(ref["tip_pos"]),
+            joints=_float64(kin["link_pos"][:, hand, self._links]),
+            ref_joints=_float64(ref_links[:, hand, self._keypoints]),
+            hand_active=bank.hand_active[motion].numpy(),
+            hand_object=torch.where(has, slot, -1).numpy(),
+            model_xml=scene.xml,
+            errors="{}",
+            env_steps=episode.env_steps,
+            num_ref_frames=int(bank.length[motion]) - 1,
+        )
+        rollout.terminations = [
             {"cause": name, "hand": side}
             for name, blamed in episode.causes.items()
             for side, is_blamed in zip(keys.SIDES, blamed, strict=True)
             if is_blamed
         ]
-        rollout = self._rollout(episode)
-        # A time-out before the end of the motion is no failure, but not complete.
-        ended = episode.frame >= self._length(episode.motion) - 1
-        complete = not why and ended
-        return Attempt(rollout, episode.motion, complete, why, episode.frame)
+        return rollout
 
-    def _length(self, motion: int) -> int:
-        return int(self.bank.length[motion])
-
-    def _rollout(self, episode: Episode) -> Rollout:
-        bank, motion = self.bank, episode.motion
-        scene = self.scenes[motion]
-        qpos = episode.steps["qpos"].astype(np.float64)
-        steps = len(qpos)
-        rows = torch.full((steps,), motion)
-        # Episodes of attempt worlds start at frame 0, so step t is scored on t + 1.
-        frames = torch.arange(1, steps + 1)
-        ref = bank.at(rows, frames)
-        kin = self._kinematics(scene, qpos)
-        joints, ref_joints, bodies = self._joints(kin, rows, frames)
-        has, slot = bank.has_object[motion], bank.hand_slot[motion]
-        objects = _objects(scene, qpos, (bank.object_index[motion] >= 0).tolist())
-        return Rollout(
-            motion=bank.names[motion],
-            hand=self.hands["left"].name,
-            fps=bank.fps,
-            decimation=self.decimation,
-            grace=grace_steps(bank.fps),
-            qpos0=episode.qpos0.astype(np.float64),
-            qvel0=episode.qvel0.astype(np.float64),
-            ctrl=episode.steps["ctrl"].astype(np.float64),
-            qpos=qpos,
-            qvel=episode.steps["qvel"].astype(np.float64),
-            object_pos=objects["pos"],
-            object_quat=objects["quat"],
-            object_qpos_adr=objects["qpos_adr"],
-            object_qvel_adr=objects["qvel_adr"],
-            ref_object_pos=_float64(ref, "object_pos"),
-            ref_object_quat=_float64(ref, "object_quat"),
-            fingertips=_float64(kin, "tip_pos"),
-            ref_fingertips=_float64(ref, "tip_pos"),
-            joints=joints,
-            ref_joints=ref_joints,
-            hand_active=bank.hand_active[motion].numpy(),
-            hand_object=torch.where(has, slot, -1).numpy(),
-            joint_bodies=json.dumps(bodies),
-            model_xml=scene.xml,
-            criterion=self.criterion,
-            errors="{}",
-            versions=self.made_by,
-            seed=self.seed,
-            env_steps=episode.env_steps,
-            actions=episode.steps["action"],
-            num_ref_frames=self._length(motion) - 1,
-            wrench=episode.steps["wrench"].astype(np.float64),
-            provenance=self.provenance,
-        )
-
-    def _kinematics(self, scene: Scene, qpos: np.ndarray) -> TensorDictBase:
+    def _hand_joints(self, scene: Scene, qpos: np.ndarray) -> torch.Tensor:
         joints = np.zeros((len(qpos), 2, self.bank.num_joints), np.float32)
         for side in scene.layout.sides:
             joints[:, keys.SIDES.index(side)] = qpos[:, scene.joint_qpos(side)]
-        return self.kinematics(torch.from_numpy(joints), None)
-
-    def _joints(
-        self, kin: TensorDictBase, rows: Tensor, frames: Tensor
-    ) -> tuple[np.ndarray, np.ndarray, list[list[str]]]:
-        """Level-1 and distal links, their human keypoints, and the body names."""
-        ref = self.bank.at(rows, frames, ("link_pos",))["link_pos"]
-        ours, theirs, bodies = [], [], []
-        for i, side in enumerate(keys.SIDES):
-            hand = self.hands[side]
-            pairs = [*hand.level1_links, *hand.distal_links]
-            order = [hand.keypoint_links.index(p) for p in pairs]
-            links = [link for link, _ in pairs]
-            ours.append(kin["link_pos"][:, i, links].double().numpy())
-            theirs.append(ref[:, i, order].double().numpy())
-            bodies.append([hand.link_names[link] for link in links])
-        return np.stack(ours, 1), np.stack(theirs, 1), bodies
+        return torch.from_numpy(joints)
 
 
-def _objects(
-    scene: Scene, qpos: np.ndarray, present: list[bool]
-) -> dict[str, np.ndarray]:
-    """Poses of all object slots, and where they lie in qpos and qvel (-1: nowhere).
-
-    Args:
-        scene: of the motion.
-        qpos: (T, nq).
-        present: which slots hold an object.
-    """
-    slots, used = len(present), scene.layout.num_objects
+def _objects(scene: Scene, qpos: np.ndarray, present: list[bool]) -> dict[str, Any]:
+    """Poses of the object slots, and where they lie in qpos and qvel (-1: nowhere)."""
+    slots = len(present)
     pose = np.zeros((len(qpos), slots, 7))
     pose[..., 3] = 1.0
-    qpos_adr, dof_adr = [-1] * slots, [-1] * slots
-    for slot in range(used):
+    qpos_adr, dof_adr = np.full(slots, -1), np.full(slots, -1)
+    for slot in range(scene.layout.num_objects):
         adr = scene.object_qpos(slot)
         pose[:, slot] = qpos[:, adr : adr + 7]
         if present[slot]:
             qpos_adr[slot], dof_adr[slot] = adr, scene.object_dof(slot)
     return {
-        "pos": pose[..., :3],
-        "quat": pose[..., 3:],
-        "qpos_adr": np.array(qpos_adr),
-        "qvel_adr": np.array(dof_adr),
+        "object_pos": pose[..., :3],
+        "object_quat": pose[..., 3:],
+        "object_qpos_adr": qpos_adr,
+        "object_qvel_adr": dof_adr,
     }
 
 
-def _float64(td: TensorDictBase, key: str) -> np.ndarray:
-    return np.asarray(td[key], dtype=np.float64)
+def _float64(values: Any) -> np.ndarray:
+    return np.asarray(values, dtype=np.float64)

@@ -16,14 +16,16 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
-from flashdex.rollouts.perturbation import Perturbation, perturb
 from flashdex.rollouts.resimulation import (
+    PERTURBATION,
+    Perturbation,
     Replay,
-    Scene,
-    load_scene,
+    Simulation,
+    load_simulation,
     model_hash,
+    perturb,
     resimulate,
 )
 from flashdex.rollouts.rollout import Rollout
@@ -36,9 +38,11 @@ from flashdex.rollouts.safety import (
 from flashdex.system.files import write_atomic
 
 CERTIFICATE_SCHEMA = 1
+PROVEN = ("certified", "robust")  # verdicts of a conversion that holds
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
 # mm; the scored object positions and the stored states are copies of one another
 MISMATCH_MM = 1e-3
+BRIEF = ("state", "reason", "failing_frame", "values")  # of a perturbed verdict
 DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
 
 
@@ -71,20 +75,14 @@ class Certificate:
     safety: dict[str, Any]
     provenance: dict[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; numbers that are not finite become None."""
-        return _finite(asdict(self))
-
     def to_json(self) -> str:
-        """JSON text of :meth:`to_dict`."""
-        return json.dumps(self.to_dict(), indent=1, allow_nan=False)
+        """JSON text; numbers that are not finite become null."""
+        text = json.dumps(asdict(self))
+        finite = json.loads(text, parse_constant=lambda _: None)
+        return json.dumps(finite, indent=1, allow_nan=False)
 
     def save(self, path: str | Path) -> Path:
-        """Write the JSON in one piece.
-
-        Args:
-            path: target, usually beside the rollout as ``<motion>.certificate.json``.
-        """
+        """Write the JSON in one piece, usually ``<motion>.certificate.json``."""
         path = Path(path)
         write_atomic(path, self.to_json() + "\n")
         return path
@@ -95,42 +93,30 @@ def certify(
     *,
     num_perturbations: int = 8,
     seed: int = 0,
-    settings: Perturbation | None = None,
+    sizes: Perturbation = PERTURBATION,
 ) -> Certificate:
-    """Replay a rollout nominally and perturbed, and judge it by its own criterion.
+    """Replay a rollout nominally and perturbed, and score it by its own criterion.
 
     The same file gives the same certificate on the same versions and processor type.
-
-    Args:
-        rollout: what was stored.
-        num_perturbations: k perturbed runs.
-        seed: seed of the perturbations.
-        settings: other sizes of the perturbations.
 
     Example:
         >>> certify(Rollout.load("rollouts/lift.npz")).verdict  # doctest: +SKIP
         'robust'
     """
-    settings = settings or Perturbation()
     criterion = resolve_criterion(rollout.criterion)
-    scene = load_scene(rollout)
-    monitor = SafetyMonitor.of(scene.model, scene.object_body)
-    nominal = resimulate(scene, rollout, monitor=monitor)
-    verdicts = score(nominal.signals, grace=rollout.grace)
-    runs = []
-    for index in range(num_perturbations):
-        changed, qpos0, ctrl = perturb(
-            scene, rollout, seed=seed, index=index, settings=settings
-        )
-        run = resimulate(changed, rollout, qpos0=qpos0, ctrl=ctrl)
-        runs.append(score(run.signals, grace=rollout.grace))
-    stored_wrench = (
-        None if rollout.wrench is None else float(np.abs(rollout.wrench).max())
-    )
-    assists = assist_sources(scene.model, scene.object_body)
-    deviation = _deviation(scene, rollout, nominal)
+    sim = load_simulation(rollout)
+    monitor = SafetyMonitor(sim.model, sim.object_body)
+    nominal = resimulate(sim, monitor=monitor)
+    runs = [
+        resimulate(perturb(sim, sizes, seed=seed, index=index)).verdicts
+        for index in range(num_perturbations)
+    ]
+    wrench = rollout.wrench
+    stored_wrench = None if wrench is None else float(np.abs(wrench).max())
+    assists = assist_sources(sim.model, sim.object_body)
+    deviation = _deviation(sim, nominal)
     verdict, reason = _decide(
-        verdicts[criterion],
+        nominal.verdicts[criterion],
         [run[criterion] for run in runs],
         is_assisted=bool(assists) or (stored_wrench or nominal.wrench_max) > 0,
         mismatch_mm=deviation["stored_mismatch_mm"],
@@ -139,7 +125,7 @@ def certify(
         verdict=verdict,
         reason=reason,
         identity=_identity(rollout, criterion),
-        model=_model_part(scene, rollout),
+        model=_model_part(sim),
         inputs={
             "num_frames": rollout.num_frames,
             "reference_length": rollout.reference_length,
@@ -148,11 +134,21 @@ def certify(
             "applied_wrench_max": nominal.wrench_max,
             "assist_sources": assists,
         },
-        nominal={name: v.to_dict() for name, v in verdicts.items()},
+        nominal={name: v.to_dict() for name, v in nominal.verdicts.items()},
         deviation=deviation,
-        perturbed=_perturbed_part(runs, seed, settings),
-        safety=_safety_part(scene, nominal, monitor),
-        provenance=_provenance(rollout),
+        perturbed=_perturbed_part(runs, seed, sizes),
+        safety={
+            **monitor.to_dict(),
+            "joint_limits": joint_limit_violations(sim.model, nominal.qpos),
+            "warnings": nominal.warnings,
+            "nan_count": nominal.nan_count,
+        },
+        provenance={
+            **json.loads(rollout.provenance),
+            "seed": rollout.seed,
+            "env_steps": rollout.env_steps,
+            "certified_on": f"{platform.system()} {platform.machine()}",
+        },
     )
 
 
@@ -189,11 +185,11 @@ def _identity(rollout: Rollout, criterion: str) -> dict[str, Any]:
     }
 
 
-def _model_part(scene: Scene, rollout: Rollout) -> dict[str, Any]:
-    option = scene.model.opt
+def _model_part(sim: Simulation) -> dict[str, Any]:
+    option = sim.model.opt
     return {
-        "xml_sha256": rollout.model_sha256,
-        "compiled_sha256": model_hash(scene.model),
+        "xml_sha256": sim.rollout.model_sha256,
+        "compiled_sha256": model_hash(sim.model),
         "timestep": option.timestep,
         "integrator": mujoco.mjtIntegrator(option.integrator).name,
         "solver": mujoco.mjtSolver(option.solver).name,
@@ -205,13 +201,14 @@ def _model_part(scene: Scene, rollout: Rollout) -> dict[str, Any]:
     }
 
 
-def _deviation(scene: Scene, rollout: Rollout, nominal: Replay) -> dict[str, Any]:
-    shift, turn = state_deviation(scene.model, nominal.qpos, rollout.qpos)
+def _deviation(sim: Simulation, nominal: Replay) -> dict[str, Any]:
+    rollout = sim.rollout
+    shift, turn = state_deviation(sim.model, nominal.qpos, rollout.qpos)
     # not <= : NaN counts as beyond
     beyond = np.flatnonzero(~((shift <= DEVIATION_M) & (turn <= DEVIATION_RAD)))
     stored = [
         np.abs(rollout.object_pos[:, slot] - rollout.qpos[:, adr : adr + 3]).max()
-        for slot, adr in enumerate(scene.object_adr)
+        for slot, adr in enumerate(sim.object_adr)
         if adr >= 0
     ]
     return {
@@ -226,67 +223,27 @@ def _deviation(scene: Scene, rollout: Rollout, nominal: Replay) -> dict[str, Any
 
 
 def _perturbed_part(
-    runs: list[dict[str, Verdict]], seed: int, settings: Perturbation
+    runs: list[dict[str, Verdict]], seed: int, sizes: Perturbation
 ) -> dict[str, Any]:
-    names = list(runs[0]) if runs else []
     counts = {
         name: {
             state: sum(run[name].state == state for run in runs)
             for state in ("passed", "failed", "not_measured")
         }
-        for name in names
+        for name in (runs[0] if runs else ())
     }
     return {
         "num_runs": len(runs),
         "seed": seed,
-        "sizes": asdict(settings),
+        "sizes": asdict(sizes),
         "counts": counts,
         "pass_fraction": {
-            name: _fraction(count["passed"], count["failed"])
+            name: count["passed"] / measured if measured else None
             for name, count in counts.items()
+            for measured in [count["passed"] + count["failed"]]
         },
-        "runs": [{name: _brief(v) for name, v in run.items()} for run in runs],
+        "runs": [
+            {name: {k: getattr(v, k) for k in BRIEF} for name, v in run.items()}
+            for run in runs
+        ],
     }
-
-
-def _fraction(passed: int, failed: int) -> float | None:
-    return passed / (passed + failed) if passed + failed else None
-
-
-def _brief(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "state": verdict.state,
-        "reason": verdict.reason,
-        "failing_frame": verdict.failing_frame,
-        "values": dict(verdict.values),
-    }
-
-
-def _safety_part(
-    scene: Scene, nominal: Replay, monitor: SafetyMonitor
-) -> dict[str, Any]:
-    return {
-        **monitor.to_dict(),
-        "joint_limits": joint_limit_violations(scene.model, nominal.qpos),
-        "warnings": nominal.warnings,
-        "nan_count": nominal.nan_count,
-    }
-
-
-def _provenance(rollout: Rollout) -> dict[str, Any]:
-    return {
-        **json.loads(rollout.provenance),
-        "seed": rollout.seed,
-        "env_steps": rollout.env_steps,
-        "certified_on": f"{platform.system()} {platform.machine()}",
-    }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

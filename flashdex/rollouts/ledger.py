@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flashdex import keys
 from flashdex.errors import RunError
-from flashdex.metrics.criteria import score
-from flashdex.rollouts.build import Attempt
-from flashdex.rollouts.certificate import certify
+from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 
@@ -23,27 +19,8 @@ CONVERSIONS = "conversions.jsonl"
 ROLLOUTS = "rollouts"
 
 
-@dataclass
-class Conversion:
-    """A motion's first passing attempt.
-
-    Attributes:
-        motion: name.
-        env_steps: counter when it passed.
-        wall_s: seconds since the run began.
-        certified: whether its certificate holds, None when none was asked for.
-        verdict: verdict of the certificate.
-    """
-
-    motion: str
-    env_steps: int
-    wall_s: float
-    certified: bool | None
-    verdict: str | None = None
-
-
 class Ledger:
-    """Judges attempts, writes a line for each, stores the first that passes.
+    """Scores attempts, writes a line for each, stores the first that passes.
 
     A stored rollout is on disk, complete, before its line is written: a crash can lose
     a line, never a conversion that has a line. ``adopt`` writes the line that is lost.
@@ -52,11 +29,16 @@ class Ledger:
         run_dir: run directory.
         names: motions of the collection.
         criterion: what counts as a conversion.
-        seed: of the run.
+        seed: of the run, for the lines.
         engine: physics engine of the rollouts.
         on_gpu: a GPU steps the physics, so that its seconds count.
         certify: replay conversions and write the certificate.
         trivial: motions that a baseline already passes.
+
+    Attributes:
+        conversions: motion -> line of its first pass, with the newest verdict.
+        attempts: motion -> number of lines.
+        last: motion -> whether its newest attempt passed.
     """
 
     def __init__(
@@ -77,119 +59,76 @@ class Ledger:
         self.names, self.criterion, self.seed = names, criterion, seed
         self.engine, self.on_gpu = engine, on_gpu
         self.certify, self.trivial = certify, trivial or {}
-        self.conversions: dict[str, Conversion] = {}
+        self.conversions: dict[str, dict[str, Any]] = {}
         self.last: dict[str, bool] = {}
         self.attempts: dict[str, int] = dict.fromkeys(names, 0)
-        self.last_line: dict[str, Any] = {}
-        self._read()
-
-    def _read(self) -> None:
-        """Take up the lines of an earlier session of the same run."""
         drop_cut_line(self.path)
-        for line in read_lines(self.path):
+        for line in read_lines(self.path):  # of earlier sessions
             # A resume may ask for another criterion, or for fewer motions.
-            same = line["criterion"] == self.criterion
-            if same and line["motion"] in self.names:
-                self._count(line)
+            if line["criterion"] == criterion and line["motion"] in names:
+                self.count(line)
 
-    def _count(self, line: dict[str, Any]) -> None:
-        name = line["motion"]
-        self.attempts[name] = self.attempts.get(name, 0) + 1
-        self.last[name] = line["converted"]
-        if line["converted"] and name not in self.conversions:
-            self.conversions[name] = Conversion(
-                name, line["env_steps"], line["wall_s"], line["certified"]
-            )
-        if line.get("verdict") is not None:
-            self.conversions[name].certified = line["certified"]
-            self.conversions[name].verdict = line["verdict"]
-
-    def record(
-        self, attempt: Attempt, *, env_steps: int, wall_s: float
-    ) -> Conversion | None:
-        """Judge one attempt and write its line.
+    def record(self, rollout: Rollout, *, wall_s: float) -> tuple[dict[str, Any], bool]:
+        """Score one attempt, write its line and count it.
 
         Args:
-            attempt: finished episode.
-            env_steps: counter of the run.
+            rollout: of a finished episode.
             wall_s: seconds since the run began, earlier sessions included.
 
         Returns:
-            The conversion, if this attempt is the motion's first that passes.
+            The line, and whether this attempt is the motion's first that passes.
         """
-        rollout = attempt.rollout
-        verdicts = score(
-            rollout.signals(), grace=rollout.grace, completed=attempt.completed
-        )
-        verdict = verdicts[self.criterion]
-        converted = verdict.is_passed
         name = rollout.motion
-        first = converted and name not in self.conversions
-        # One lucky draw is not the last word: later passes may still be proven.
-        unproven = self.certify and not first and converted
-        unproven = unproven and not self.conversions[name].certified
-        line: dict[str, Any] = {
-            "motion": name,
-            "converted": converted,
-            "certified": None,
-            "criterion": self.criterion,
-            "errors": {k: round(v, 6) for k, v in verdict.values.items()},
-            "passed": [k for k, v in verdicts.items() if v.is_passed],
-            "completed": attempt.completed,
-            "hands": [
-                side
-                for side, on in zip(keys.SIDES, rollout.hand_active, strict=True)
-                if on
-            ],
-            "why": _why(attempt, verdict.reason, verdict.blame),
-            "frame": attempt.frame,
-            "env_steps": env_steps,
+        line = {
+            **rollout.summary(self.criterion),
             "wall_s": round(wall_s, 3),
             "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
             "trivial": self.trivial.get(name, []),
         }
-        if first or unproven:
-            line.update(self._store(attempt, line))
+        before = self.conversions.get(name)
+        # One lucky draw is not the last word: later passes may still be proven.
+        unproven = before is None or (self.certify and not before["certified"])
+        if line["converted"] and unproven:
+            line.update(self._store(rollout, line["errors"]))
         append_line(self.path, line)
-        self.last_line = line
-        return self.take(line)
+        return line, self.count(line)
 
-    def take(self, line: dict[str, Any]) -> Conversion | None:
-        """Count a line that is in the file, written here or by another process.
+    def count(self, line: dict[str, Any]) -> bool:
+        """Count a line that is in the file; is it the motion's first that passes?"""
+        name = line["motion"]
+        self.attempts[name] = self.attempts.get(name, 0) + 1
+        self.last[name] = line["converted"]
+        is_first = line["converted"] and name not in self.conversions
+        if is_first:
+            self.conversions[name] = dict(line)
+        if line.get("verdict") is not None:
+            newest = {key: line[key] for key in ("certified", "verdict")}
+            self.conversions[name].update(newest)
+        return is_first
 
-        Args:
-            line: of one attempt.
-
-        Returns:
-            The conversion, if it is the motion's first.
-        """
-        known = line["motion"] in self.conversions
-        self._count(line)
-        return None if known else self.conversions.get(line["motion"])
-
-    def _store(self, attempt: Attempt, line: dict[str, Any]) -> dict[str, Any]:
-        rollout = attempt.rollout
-        rollout.errors = json.dumps(line["errors"])
+    def _store(self, rollout: Rollout, errors: dict[str, float]) -> dict[str, Any]:
+        """Store a rollout that passed; what its line says of the file."""
+        rollout.errors = json.dumps(errors)
         path = self.rollouts / f"{rollout.motion}.npz"
         rollout.save(path)
         out: dict[str, Any] = {"rollout": f"{ROLLOUTS}/{path.name}"}
-        if self.certify:
-            try:
-                certificate = certify(rollout)
-            except RunError as error:
-                _LOG.warning("%s: not certified: %s", rollout.motion, error)
-                return {**out, "certified": False, "verdict": "not_measured"}
-            certificate.save(path.with_suffix(".certificate.json"))
-            out["certified"] = certificate.verdict in ("certified", "robust")
-            out["verdict"] = certificate.verdict
-        return out
+        if not self.certify:
+            return out
+        try:
+            certificate = certify(rollout)
+        except RunError as error:
+            _LOG.warning("%s: not certified: %s", rollout.motion, error)
+            return {**out, "certified": False, "verdict": "not_measured"}
+        certificate.save(path.with_suffix(".certificate.json"))
+        verdict = certificate.verdict
+        return {**out, "certified": verdict in PROVEN, "verdict": verdict}
 
     def adopt(self, *, wall_s: float) -> list[str]:
         """Write the lines of stored rollouts that a crash left without one.
 
-        Each is judged anew from its file alone. One that does not pass stays where it
+        Each is scored anew from its file alone. One that does not pass stays where it
         is, without a line; a later conversion replaces it.
 
         Args:
@@ -198,24 +137,21 @@ class Ledger:
         Returns:
             Motions whose lines were written.
         """
-        told = {
-            line["rollout"]: line["env_steps"]
-            for line in read_lines(self.path)
-            if line.get("rollout")
-        }
+        lines = read_lines(self.path)
+        told = {x["rollout"]: x["env_steps"] for x in lines if x.get("rollout")}
         out = []
-        for row, name in enumerate(self.names):
+        for name in self.names:
             path = self.rollouts / f"{name}.npz"
             if not path.is_file():
                 continue
+            with np.load(path, allow_pickle=False) as file:
+                made_at = int(file["env_steps"])
             # A later pass replaces the file of an unproven one: compare when it was.
-            if told.get(f"{ROLLOUTS}/{path.name}") == _env_steps(path):
+            if told.get(f"{ROLLOUTS}/{path.name}") == made_at:
                 continue
-            attempt = _stored_attempt(path, row)
-            verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
-            if verdicts[self.criterion].is_passed:
-                steps = attempt.rollout.env_steps
-                self.record(attempt, env_steps=steps, wall_s=wall_s)
+            rollout = Rollout.load(path)
+            if rollout.score()[self.criterion].is_passed:
+                self.record(rollout, wall_s=wall_s)
                 out.append(name)
         return out
 
@@ -243,55 +179,21 @@ class Ledger:
     @property
     def num_certified(self) -> int:
         """Converted motions whose certificate holds."""
-        return sum(bool(c.certified) for c in self.conversions.values())
-
-    @property
-    def num_robust(self) -> int:
-        """Converted motions whose certificate holds under disturbances too."""
-        return sum(c.verdict == "robust" for c in self.conversions.values())
+        return sum(bool(c["certified"]) for c in self.conversions.values())
 
     def metrics(self, hours: float) -> dict[str, float]:
         """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
         passing = sum(self.last.get(n, False) for n in self.names)
+        robust = sum(c.get("verdict") == "robust" for c in self.conversions.values())
         out = {
             "convert/cumulative": float(self.num_converted),
             "convert/rate": self.num_converted / total,
             "convert/last": passing / total,
             "convert/certified": float(self.num_certified),
-            "convert/robust": float(self.num_robust),
+            "convert/robust": float(robust),
             "convert/attempts": float(self.num_attempts),
         }
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours
         return out
-
-
-def _env_steps(path: Path) -> int:
-    """When a stored rollout was made; reads nothing else of the file."""
-    with np.load(path, allow_pickle=False) as file:
-        return int(file["env_steps"])
-
-
-def _stored_attempt(path: Path, row: int) -> Attempt:
-    """A stored rollout as the attempt it was."""
-    rollout = Rollout.load(path)
-    complete = rollout.num_frames >= rollout.reference_length
-    return Attempt(rollout, row, complete, [], rollout.num_frames)
-
-
-def _why(attempt: Attempt, reason: str, blame: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """Causes of a failed attempt: what ended it, or which limit which hand crossed."""
-    if attempt.why:
-        return [dict(w) for w in attempt.why]
-    if blame:
-        return [
-            {
-                "cause": b.term,
-                "hand": b.side,
-                "value": round(b.value, 5),
-                "frame": b.frame,
-            }
-            for b in blame
-        ]
-    return [{"cause": reason}] if reason else []

@@ -5,43 +5,32 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flashdex.errors import RunError
-from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.ledger import CONVERSIONS, ROLLOUTS, read_lines
+from flashdex.rollouts.certificate import PROVEN, certify
+from flashdex.rollouts.ledger import CONVERSIONS, ROLLOUTS
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.jsonl import read_lines
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """One recomputed certificate.
-
-    Attributes:
-        motion: name.
-        stored: verdict in the run's files, None when there is none.
-        found: verdict of this replay.
-        agrees: both are the same and their nominal errors are equal to 1e-9.
-    """
+    """One recomputed certificate."""
 
     motion: str
-    stored: str | None
-    found: str
-    agrees: bool
+    stored: str | None  # verdict in the run's files, None when there is none
+    found: str  # verdict of this replay
+    agrees: bool  # both are the same, with nominal errors equal to 1e-9
 
     @property
     def holds(self) -> bool:
         """The conversion is proven, and the files say so truthfully."""
-        return self.agrees and self.found in ("certified", "robust")
+        return self.agrees and self.found in PROVEN
 
 
 def replay(run: str | Path) -> list[Replayed]:
-    """Re-simulate every stored rollout in MuJoCo C and compare the certificates.
-
-    Args:
-        run: run directory.
-
-    Returns:
-        One entry a stored rollout.
+    """Re-simulate every stored rollout of a run in MuJoCo C; compare the certificates.
 
     Raises:
         RunError: there is nothing to replay, or a file is broken.
@@ -82,14 +71,13 @@ def _replay_one(file: Path, proven: set[str]) -> Replayed:
     return Replayed(rollout.motion, stored["verdict"], found.verdict, agrees)
 
 
-def _same_numbers(stored: dict, found: dict) -> bool:  # type: ignore[type-arg]
-    for name, verdict in stored.items():
-        other = found.get(name)
-        if other is None or other["state"] != verdict["state"]:
-            return False
-        for key, value in verdict["values"].items():
-            if value is None:
-                continue
-            if abs(value - other["values"][key]) > 1e-9:
-                return False
-    return True
+def _same_numbers(stored: dict[str, Any], found: dict[str, Any]) -> bool:
+    return all(
+        name in found
+        and found[name]["state"] == verdict["state"]
+        and all(
+            value is None or abs(value - found[name]["values"][key]) <= 1e-9
+            for key, value in verdict["values"].items()
+        )
+        for name, verdict in stored.items()
+    )

@@ -1,4 +1,4 @@
-"""Open-loop replay of stored controls in MuJoCo C, and the signals of what happened.
+"""Open-loop replay of stored controls in MuJoCo C, as stored or a little disturbed.
 
 No wrench, no feedback, no reset: the first state, the control rows, and the model of
 the file. Fingertips and links are recomputed from the model's sites and bodies.
@@ -6,86 +6,71 @@ the file. Fingertips and links are recomputed from the model's sites and bodies.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from flashdex.errors import RunError
 from flashdex.keys import FINGERS, SIDES
-from flashdex.metrics.errors import Signals, compute_signals
+from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria_table import Verdict
+from flashdex.metrics.errors import TrackingErrors
 from flashdex.rollouts.rollout import Rollout
 
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200
 # MuJoCo goes on after these, with contacts dropped or controls set to zero
-NUMERIC_WARNINGS = (
-    "mjWARN_CONTACTFULL",
-    "mjWARN_CNSTRFULL",
-    "mjWARN_BADCTRL",
-    "mjWARN_BADQPOS",
-    "mjWARN_BADQVEL",
-    "mjWARN_BADQACC",
+NUMERIC_WARNINGS = tuple(
+    f"mjWARN_{what}"
+    for what in ("CONTACTFULL", "CNSTRFULL", "BADCTRL", "BADQPOS", "BADQVEL", "BADQACC")
 )
 
 StepMonitor = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A compiled model and where the rollout's objects and hands are in it.
+class Simulation:
+    """What a rollout is replayed with, and where its parts are in the model (or -1)."""
 
-    Args:
-        model: compiled model.
-        object_body: body of each object slot, -1 when empty, (O,).
-        object_adr: qpos address of each slot, -1 when empty, (O,).
-        pad_sites: fingertip sites, (2, 5), -1 when absent.
-        joint_bodies: bodies of ``joints``, (2, M).
-        wrist_bodies: (2,), -1 when absent.
-    """
-
+    rollout: Rollout  # reference, first velocities, masks
     model: mujoco.MjModel
-    object_body: np.ndarray
-    object_adr: np.ndarray
-    pad_sites: np.ndarray
-    joint_bodies: np.ndarray
-    wrist_bodies: np.ndarray
+    qpos0: np.ndarray  # first positions, (nq,)
+    ctrl: np.ndarray  # position targets, (T, nu)
+    object_body: np.ndarray  # body of each object slot, (O,)
+    object_adr: np.ndarray  # qpos address of each object slot, (O,)
+    pad_sites: np.ndarray  # fingertip sites, (2, 5)
+    joint_bodies: np.ndarray  # bodies of ``joints``, (2, M)
+    wrist_bodies: np.ndarray  # (2,)
 
 
 @dataclass(frozen=True)
 class Replay:
-    """States and counts of one open-loop run; world, m, rad, wxyz.
+    """States and counts of one open-loop replay; world, m, rad, wxyz."""
 
-    Args:
-        qpos: after each control step, (T, nq).
-        signals: errors against the rollout's reference.
-        warnings: MuJoCo warning -> times raised.
-        nan_count: values of the states that are not finite.
-        wrench_max: largest applied force or torque seen, N or N m.
-    """
-
-    qpos: np.ndarray
-    signals: Signals
-    warnings: dict[str, int]
-    nan_count: int
-    wrench_max: float
+    qpos: np.ndarray  # after each control step, (T, nq)
+    errors: TrackingErrors  # against the rollout's reference
+    verdicts: dict[str, Verdict]  # of every criterion
+    warnings: dict[str, int]  # MuJoCo warning -> times raised
+    nan_count: int  # values of the states that are not finite
+    wrench_max: float  # largest applied force or torque seen, N or N m
 
 
-def load_scene(rollout: Rollout) -> Scene:
+def load_simulation(rollout: Rollout) -> Simulation:
     """Compile the model of a rollout and find its parts; RunError when they are absent.
 
     Args:
         rollout: a checked rollout.
     """
+    motion = rollout.motion
     try:
         model = mujoco.MjModel.from_xml_string(rollout.model_xml)
     except ValueError as error:
-        raise RunError(
-            f"{rollout.motion}: model_xml does not compile: {error}"
-        ) from None
+        raise RunError(f"{motion}: model_xml does not compile: {error}") from None
     model.opt.iterations = max(model.opt.iterations, MIN_ITERATIONS)
     model.opt.ls_iterations = max(model.opt.ls_iterations, MIN_LS_ITERATIONS)
     # a diverged state must stay visible instead of being reset
@@ -95,13 +80,16 @@ def load_scene(rollout: Rollout) -> Scene:
     wrists = json.loads(rollout.wrist_bodies or "[null, null]")
     active = rollout.hand_active.astype(bool)
     named = [n if on else None for n, on in zip(wrists, active, strict=True)]
-    return Scene(
+    return Simulation(
+        rollout=rollout,
         model=model,
-        object_body=np.array([_free_body(model, a, rollout.motion) for a in adr]),
+        qpos0=rollout.qpos0,
+        ctrl=rollout.ctrl,
+        object_body=np.array([_free_body(model, a, motion) for a in adr]),
         object_adr=adr,
         pad_sites=np.array([[_site(model, s, f) for f in FINGERS] for s in SIDES]),
         joint_bodies=_joint_bodies(model, rollout),
-        wrist_bodies=np.array([_body(model, n, rollout.motion) for n in named]),
+        wrist_bodies=np.array([_body(model, n, motion) for n in named]),
     )
 
 
@@ -122,15 +110,12 @@ def _joint_bodies(model: mujoco.MjModel, rollout: Rollout) -> np.ndarray:
 
 
 def _check_sizes(model: mujoco.MjModel, rollout: Rollout) -> None:
-    for key, value, size in (
-        ("qpos0", rollout.qpos0, model.nq),
-        ("qvel0", rollout.qvel0, model.nv),
-        ("ctrl", rollout.ctrl, model.nu),
-    ):
-        if value.shape[-1] != size:
+    for key, size in (("qpos0", model.nq), ("qvel0", model.nv), ("ctrl", model.nu)):
+        columns = getattr(rollout, key).shape[-1]
+        if columns != size:
             raise RunError(
-                f"{rollout.motion}: {key} has {value.shape[-1]} columns, the model "
-                f"needs {size}. Model and states are not of the same scene."
+                f"{rollout.motion}: {key} has {columns} columns, the model needs "
+                f"{size}. Model and states are not of the same scene."
             )
 
 
@@ -161,115 +146,28 @@ def _body(model: mujoco.MjModel, name: str | None, motion: str) -> int:
 
 
 def model_hash(model: mujoco.MjModel) -> str:
-    """SHA-256 of the compiled model.
-
-    Args:
-        model: compiled model.
-    """
+    """SHA-256 of the compiled model."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.sha256(buffer.tobytes()).hexdigest()
 
 
-def replay_points(scene: Scene, qpos: np.ndarray) -> dict[str, np.ndarray]:
-    """Fingertips, links and wrists at given joint positions, by forward kinematics.
+def resimulate(sim: Simulation, *, monitor: StepMonitor | None = None) -> Replay:
+    """Apply the controls open loop from the first state.
 
     Args:
-        scene: model and addresses.
-        qpos: (T, nq).
-
-    Returns:
-        ``fingertips`` (T, 2, 5, 3), ``joints`` (T, 2, M, 3), ``wrist_pos`` (T, 2, 3),
-        world, m; NaN for absent parts.
-    """
-    data = mujoco.MjData(scene.model)
-    rows: dict[str, list[np.ndarray]] = {
-        "fingertips": [],
-        "joints": [],
-        "wrist_pos": [],
-    }
-    for row in qpos:
-        data.qpos[:] = row
-        mujoco.mj_kinematics(scene.model, data)
-        rows["fingertips"].append(data.site_xpos[scene.pad_sites])
-        rows["joints"].append(data.xpos[scene.joint_bodies])
-        rows["wrist_pos"].append(data.xpos[scene.wrist_bodies])
-    parts = scene.pad_sites, scene.joint_bodies, scene.wrist_bodies
-    points = {key: np.stack(values) for key, values in rows.items()}
-    for value, index in zip(points.values(), parts, strict=True):
-        value[:, index < 0] = np.nan
-    return points
-
-
-def _object_poses(scene: Scene, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    poses = [
-        qpos[:, a : a + 7] if a >= 0 else np.full((len(qpos), 7), np.nan)
-        for a in scene.object_adr
-    ]
-    pose = np.stack(poses, axis=1)
-    return pose[..., :3], pose[..., 3:]
-
-
-def replay_signals(
-    scene: Scene, rollout: Rollout, qpos: np.ndarray, *, overflow: bool = False
-) -> Signals:
-    """Errors of re-simulated states against the rollout's reference.
-
-    Args:
-        scene: model and addresses.
-        rollout: reference and masks.
-        qpos: (T, nq).
-        overflow: the engine warned of numerics.
-    """
-    parts = scene.pad_sites, scene.joint_bodies, scene.wrist_bodies
-    active = np.flatnonzero(rollout.hand_active)
-    # a part that the model lacks is a hole of the file, not a failure
-    data: dict[str, np.ndarray | None] = {
-        key: None if (index[active] < 0).any() else points
-        for (key, points), index in zip(
-            replay_points(scene, qpos).items(), parts, strict=True
-        )
-    }
-    data["object_pos"], data["object_quat"] = _object_poses(scene, qpos)
-    for key in ("object_pos", "object_quat", "fingertips", "joints", "wrist_pos"):
-        data[f"ref_{key}"] = getattr(rollout, f"ref_{key}")
-    return compute_signals(
-        data,
-        hand_active=rollout.hand_active.tolist(),
-        hand_object=rollout.hand_object.tolist(),
-        fps=rollout.fps,
-        num_ref_frames=rollout.reference_length,
-        overflow=overflow,
-    )
-
-
-def resimulate(
-    scene: Scene,
-    rollout: Rollout,
-    *,
-    qpos0: np.ndarray | None = None,
-    ctrl: np.ndarray | None = None,
-    monitor: StepMonitor | None = None,
-) -> Replay:
-    """Apply the stored controls open loop from the stored first state.
-
-    Args:
-        scene: model (possibly perturbed) and addresses.
-        rollout: first state, controls, reference.
-        qpos0: other first positions, (nq,).
-        ctrl: other controls, (T, nu).
+        sim: as stored, or perturbed.
         monitor: called after every substep.
     """
-    model = scene.model
+    model, rollout = sim.model, sim.rollout
     data = mujoco.MjData(model)
-    data.qpos[:] = rollout.qpos0 if qpos0 is None else qpos0
+    data.qpos[:] = sim.qpos0
     data.qvel[:] = rollout.qvel0
     if rollout.act0 is not None and model.na:
         data.act[:] = rollout.act0
-    controls = rollout.ctrl if ctrl is None else ctrl
-    qpos = np.empty((len(controls), model.nq))
+    qpos = np.empty((len(sim.ctrl), model.nq))
     nan_count, wrench_max = 0, 0.0
-    for t, row in enumerate(controls):
+    for t, row in enumerate(sim.ctrl):
         data.ctrl[:] = row
         for _ in range(rollout.decimation):
             mujoco.mj_step(model, data)
@@ -281,16 +179,141 @@ def resimulate(
         )
         applied = max(np.abs(data.xfrc_applied).max(), np.abs(data.qfrc_applied).max())
         wrench_max = max(wrench_max, float(applied))
-    warnings = _warnings(data)
-    overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
-    signals = replay_signals(scene, rollout, qpos, overflow=overflow)
-    return Replay(qpos, signals, warnings, nan_count, wrench_max)
-
-
-def _warnings(data: mujoco.MjData) -> dict[str, int]:
-    kinds = mujoco.mjtWarning.__members__
-    return {
+    warnings = {
         name: int(data.warning[kind].number)
-        for name, kind in kinds.items()
+        for name, kind in mujoco.mjtWarning.__members__.items()
         if name.startswith("mjWARN_")
     }
+    overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
+    states = {**_tracked_points(sim, qpos), **_object_poses(sim, qpos)}
+    errors = rollout.errors_of(states, overflow=overflow)
+    verdicts = score(errors, grace=rollout.grace)
+    return Replay(qpos, errors, verdicts, warnings, nan_count, wrench_max)
+
+
+def _tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+    """Fingertips, links and wrists by forward kinematics, (T, 2, ..., 3)."""
+    data = mujoco.MjData(sim.model)
+    parts = {
+        "fingertips": (data.site_xpos, sim.pad_sites),
+        "joints": (data.xpos, sim.joint_bodies),
+        "wrist_pos": (data.xpos, sim.wrist_bodies),
+    }
+    points = {
+        key: np.empty((len(qpos), *index.shape, 3)) for key, (_, index) in parts.items()
+    }
+    for t, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(sim.model, data)
+        for key, (xpos, index) in parts.items():
+            points[key][t] = xpos[index]
+    active = np.flatnonzero(sim.rollout.hand_active)
+    found: dict[str, np.ndarray | None] = {}
+    for key, (_, index) in parts.items():
+        points[key][:, index < 0] = np.nan
+        # a part that the model lacks is a hole of the file, not a failure
+        found[key] = None if (index[active] < 0).any() else points[key]
+    return found
+
+
+def _object_poses(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+    pose = np.full((len(qpos), len(sim.object_adr), 7), np.nan)
+    for slot, adr in enumerate(sim.object_adr):
+        if adr >= 0:
+            pose[:, slot] = qpos[:, adr : adr + 7]
+    return {"object_pos": pose[..., :3], "object_quat": pose[..., 3:]}
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Sizes of the disturbances; they are part of the certificate's schema."""
+
+    object_pos: float = 2e-3  # first position, uniform per axis, m
+    object_rot: float = float(np.radians(2.0))  # about a random axis, uniform, rad
+    mass: tuple[float, float] = (0.8, 1.2)  # factor of mass and inertia, uniform
+    friction: tuple[float, float] = (0.8, 1.2)  # factor of all friction, uniform
+    ctrl_noise: float = 5e-3  # normal, std as a share of the actuator's range
+    # a slide's range counts at most as this much, m: a wrist that may travel metres
+    # would else be shaken by centimetres; the same for hinges, rad
+    ctrl_range_m: float = 0.4
+    ctrl_range_rad: float = float(np.pi)
+
+
+PERTURBATION = Perturbation()
+
+
+def perturb(
+    sim: Simulation, sizes: Perturbation = PERTURBATION, *, seed: int, index: int
+) -> Simulation:
+    """The same rollout, a little disturbed: what a robust conversion survives.
+
+    Args:
+        sim: as stored.
+        sizes: of the disturbances.
+        seed: of the certificate.
+        index: number of the perturbed replay.
+    """
+    rng = np.random.default_rng([seed, index])
+    model = _perturb_model(sim, rng, sizes)
+    qpos0 = perturb_objects(sim, rng, sizes)
+    width = control_range(sim.model, sim.ctrl, sizes)
+    noise = rng.normal(size=sim.ctrl.shape) * sizes.ctrl_noise * width
+    return replace(sim, model=model, qpos0=qpos0, ctrl=sim.ctrl + noise)
+
+
+def _perturb_model(
+    sim: Simulation, rng: np.random.Generator, sizes: Perturbation
+) -> mujoco.MjModel:
+    """A copy of the model with other object masses and another friction."""
+    model = copy.deepcopy(sim.model)
+    for body in sim.object_body[sim.object_body >= 0]:
+        factor = rng.uniform(*sizes.mass)
+        tree = model.body_rootid == model.body_rootid[body]
+        model.body_mass[tree] *= factor
+        model.body_inertia[tree] *= factor
+    factor = rng.uniform(*sizes.friction)
+    model.geom_friction[:] *= factor
+    model.pair_friction[:] *= factor
+    # inverse weights of the solver follow from the masses
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def perturb_objects(
+    sim: Simulation, rng: np.random.Generator, sizes: Perturbation
+) -> np.ndarray:
+    """First positions with every object shifted and turned a little, (nq,)."""
+    qpos = np.array(sim.qpos0, dtype=np.float64)
+    for adr in sim.object_adr[sim.object_adr >= 0]:
+        shift = rng.uniform(-sizes.object_pos, sizes.object_pos, size=3)
+        axis = rng.normal(size=3)
+        angle = rng.uniform(-sizes.object_rot, sizes.object_rot)
+        turn, quat = np.empty(4), np.empty(4)
+        mujoco.mju_axisAngle2Quat(turn, axis / np.linalg.norm(axis), angle)
+        mujoco.mju_mulQuat(quat, turn, qpos[adr + 3 : adr + 7])
+        qpos[adr : adr + 3] += shift
+        qpos[adr + 3 : adr + 7] = quat
+    return qpos
+
+
+def control_range(
+    model: mujoco.MjModel, ctrl: np.ndarray, sizes: Perturbation
+) -> np.ndarray:
+    """Range of each actuator: its own, else its joint's, else the span of ctrl (T, nu).
+
+    Returns:
+        m or rad, at most the caps of ``sizes``, (nu,).
+    """
+    width = np.ptp(ctrl, axis=0)
+    for i in range(model.nu):
+        joint = int(model.actuator_trnid[i, 0])
+        drives_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        if model.actuator_ctrllimited[i]:
+            width[i] = np.ptp(model.actuator_ctrlrange[i])
+        elif drives_joint and model.jnt_limited[joint]:
+            width[i] = np.ptp(model.jnt_range[joint])
+        if drives_joint:
+            is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+            cap = sizes.ctrl_range_m if is_slide else sizes.ctrl_range_rad
+            width[i] = min(width[i], cap)
+    return width

@@ -9,150 +9,37 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
 from flashdex.errors import RunError
-from flashdex.metrics.errors import Signals, compute_signals
+from flashdex.keys import SIDES
+from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria_table import Verdict
+from flashdex.metrics.errors import TrackingErrors, compute_tracking_errors
 from flashdex.system.files import open_atomic
 
 ROLLOUT_SCHEMA = 1
 
-# shape symbols: T control steps, O object slots, M joints of joint_error, H = 2 hands
-SHAPES: dict[str, str] = {
-    "qpos0": "nq",
-    "qvel0": "nv",
-    "ctrl": "T nu",
-    "qpos": "T nq",
-    "qvel": "T nv",
-    "object_pos": "T O 3",
-    "object_quat": "T O 4",
-    "ref_object_pos": "T O 3",
-    "ref_object_quat": "T O 4",
-    "fingertips": "T 2 5 3",
-    "ref_fingertips": "T 2 5 3",
-    "joints": "T 2 M 3",
-    "ref_joints": "T 2 M 3",
-    "hand_active": "2",
-    "hand_object": "2",
-    "object_qpos_adr": "O",
-    "object_qvel_adr": "O",
-    "actions": "T 2 A",
-    "wrist_pos": "T 2 3",
-    "ref_wrist_pos": "T 2 3",
-    "act0": "na",
-    "wrench": "T O 6",
-}
-
-
-def check_schema(data: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Refuse files of another format or version.
-
-    Args:
-        data: arrays of the file.
-        path: file name for the message.
-    """
-    if "schema" not in data:
-        raise RunError(f"{path}: missing key schema; this is not a flashdex rollout.")
-    if int(data["schema"]) != ROLLOUT_SCHEMA:
-        raise RunError(
-            f"{path}: schema {int(data['schema'])}, this version reads "
-            f"{ROLLOUT_SCHEMA}. Store the rollout again or use the matching version."
-        )
-
-
-def check_shape(
-    key: str, value: np.ndarray, symbols: str, sizes: dict[str, int], where: str
-) -> None:
-    """Compare a shape with its symbols; a symbol keeps the size it first had.
-
-    Args:
-        key: name of the array.
-        value: the array.
-        symbols: e.g. ``T 2 5 3``.
-        sizes: sizes seen so far; new symbols are added.
-        where: file name for the message.
-    """
-    names = symbols.split()
-    fits = value.ndim == len(names) and all(
-        size == (int(name) if name.isdigit() else sizes.setdefault(name, size))
-        for name, size in zip(names, value.shape, strict=True)
-    )
-    if not fits:
-        known = ", ".join(f"{n}={sizes[n]}" for n in names if n in sizes)
-        raise RunError(
-            f"{where}: {key} has shape {value.shape}, expected ({symbols})"
-            f"{' with ' + known if known else ''}. Store the rollout again."
-        )
-
-
-def check_json(key: str, text: str, where: str) -> None:
-    """Refuse a field that is not JSON; ``wrist_bodies`` may be empty.
-
-    Args:
-        key: name of the field.
-        text: its content.
-        where: file name for the message.
-    """
-    if not text and key == "wrist_bodies":
-        return
-    try:
-        json.loads(text)
-    except json.JSONDecodeError as error:
-        raise RunError(f"{where}: {key} is not JSON ({error}).") from error
-
 
 @dataclass
 class Rollout:
-    """One attempt, with everything that is needed to replay and to judge it.
+    """One attempt, with everything that is needed to replay and to score it.
 
     Row t of every (T, ...) array belongs to control step t: ``ctrl[t]`` is applied for
     ``decimation`` substeps, the states are those AFTER it, and ``ref_*[t]`` is the
     reference it is scored on. World frame, metres, radians, quaternions wxyz.
 
-    Args:
-        motion: motion id.
-        hand: name of the hand model.
-        fps: control rate, Hz.
-        decimation: substeps a control step.
-        grace: first steps that the ManipTrans family does not score.
-        qpos0: first state, (nq,).
-        qvel0: (nv,).
-        ctrl: position targets, (T, nu).
-        qpos: (T, nq).
-        qvel: (T, nv).
-        object_pos: object frames, m, (T, O, 3).
-        object_quat: (T, O, 4).
-        ref_object_pos: (T, O, 3).
-        ref_object_quat: (T, O, 4).
-        fingertips: pad points, m, (T, 2, 5, 3).
-        ref_fingertips: human tips, m, (T, 2, 5, 3).
-        joints: level-1 links, then distal links, m, (T, 2, M, 3).
-        ref_joints: human joints in the same order, m, (T, 2, M, 3).
-        hand_active: hands [left, right] that take part, (2,) bool.
-        hand_object: object slot of each hand, -1 without object, (2,).
-        object_qpos_adr: address of each free joint, -1 for an empty slot, (O,).
-        object_qvel_adr: (O,).
-        joint_bodies: JSON, per hand the M body names behind ``joints``.
-        model_xml: self-contained MJCF.
-        criterion: name of the criterion the rollout was stored for.
-        errors: JSON, numbers of that criterion.
-        versions: JSON, package versions and the engine that produced the states.
-        seed: seed of the run.
-        env_steps: env steps at which the rollout was made.
-        actions: policy outputs, (T, 2, A).
-        model_sha256: hash of ``model_xml``; computed when empty.
-        num_ref_frames: length of the whole reference, -1 when it is T.
-        wrist_pos: m, (T, 2, 3), or None.
-        ref_wrist_pos: m, (T, 2, 3), or None.
-        wrist_bodies: JSON, the two body names behind ``wrist_pos``, or empty.
-        act0: first actuator state, (na,), or None for zeros.
-        wrench: assist force and torque on each object, (T, O, 6), or None.
-        provenance: JSON: recipe hash, collection hash, checkpoint hash, date, hardware.
+    T control steps, O object slots, M joints of the criteria, 2 hands [left, right], 5
+    fingers [thumb, index, middle, ring, pinky].
+
+    Attributes:
+        terminations: what ended the attempt early, ``cause`` and ``hand`` of each. The
+            ledger's line has them; the file has not.
 
     Example:
         >>> Rollout.load("runs/demo/rollouts/lift.npz").num_frames  # doctest: +SKIP
@@ -160,47 +47,48 @@ class Rollout:
     """
 
     motion: str
-    hand: str
-    fps: float
-    decimation: int
-    grace: int
-    qpos0: np.ndarray
-    qvel0: np.ndarray
-    ctrl: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    object_pos: np.ndarray
-    object_quat: np.ndarray
-    ref_object_pos: np.ndarray
-    ref_object_quat: np.ndarray
-    fingertips: np.ndarray
-    ref_fingertips: np.ndarray
-    joints: np.ndarray
-    ref_joints: np.ndarray
-    hand_active: np.ndarray
-    hand_object: np.ndarray
-    object_qpos_adr: np.ndarray
-    object_qvel_adr: np.ndarray
-    joint_bodies: str
-    model_xml: str
-    criterion: str
-    errors: str
-    versions: str
-    seed: int
-    env_steps: int
-    actions: np.ndarray
-    model_sha256: str = ""
-    num_ref_frames: int = -1
-    wrist_pos: np.ndarray | None = None
-    ref_wrist_pos: np.ndarray | None = None
-    wrist_bodies: str = ""
-    act0: np.ndarray | None = None
-    wrench: np.ndarray | None = None
-    provenance: str = "{}"
+    hand: str  # name of the hand model
+    fps: float  # control rate, Hz
+    decimation: int  # substeps a control step
+    grace: int  # first steps that the ManipTrans family does not score
+    qpos0: Annotated[np.ndarray, "nq"]
+    qvel0: Annotated[np.ndarray, "nv"]
+    ctrl: Annotated[np.ndarray, "T nu"]  # position targets
+    qpos: Annotated[np.ndarray, "T nq"]
+    qvel: Annotated[np.ndarray, "T nv"]
+    object_pos: Annotated[np.ndarray, "T O 3"]  # object frames
+    object_quat: Annotated[np.ndarray, "T O 4"]
+    ref_object_pos: Annotated[np.ndarray, "T O 3"]
+    ref_object_quat: Annotated[np.ndarray, "T O 4"]
+    fingertips: Annotated[np.ndarray, "T 2 5 3"]  # pad points
+    ref_fingertips: Annotated[np.ndarray, "T 2 5 3"]  # human tips
+    joints: Annotated[np.ndarray, "T 2 M 3"]  # level-1 links, then distal links
+    ref_joints: Annotated[np.ndarray, "T 2 M 3"]  # human joints in the same order
+    hand_active: Annotated[np.ndarray, "2"]  # hands that take part
+    hand_object: Annotated[np.ndarray, "2"]  # object slot, -1 without object
+    object_qpos_adr: Annotated[np.ndarray, "O"]  # of the free joint, -1: empty slot
+    object_qvel_adr: Annotated[np.ndarray, "O"]
+    joint_bodies: str  # JSON, per hand the M body names behind joints
+    model_xml: str  # self-contained MJCF
+    criterion: str  # that the rollout was stored for
+    errors: str  # JSON, numbers of that criterion
+    versions: str  # JSON, of the packages and the engine that produced the states
+    seed: int  # of the run
+    env_steps: int  # of the run, when the rollout was made
+    actions: Annotated[np.ndarray, "T 2 A"]  # policy outputs
+    model_sha256: str = ""  # of model_xml; computed when empty
+    num_ref_frames: int = -1  # length of the whole reference, -1 when it is T
+    wrist_pos: Annotated[np.ndarray | None, "T 2 3"] = None
+    ref_wrist_pos: Annotated[np.ndarray | None, "T 2 3"] = None
+    wrist_bodies: str = ""  # JSON, the two body names behind wrist_pos, or empty
+    act0: Annotated[np.ndarray | None, "na"] = None  # first actuator state; None: 0
+    wrench: Annotated[np.ndarray | None, "T O 6"] = None  # assist force and torque
+    provenance: str = "{}"  # JSON: hashes of recipe, library, checkpoint; date
 
     def __post_init__(self) -> None:
+        self.terminations: list[dict[str, str]] = []
         if not self.model_sha256:
-            self.model_sha256 = xml_sha256(self.model_xml)
+            self.model_sha256 = _sha256(self.model_xml)
         self.validate()
 
     @property
@@ -208,22 +96,73 @@ class Rollout:
         """Control steps, T."""
         return len(self.ctrl)
 
-    def signals(self) -> Signals:
-        """Errors of the STORED states, as training saw them."""
-        names = ("object_pos", "object_quat", "fingertips", "joints", "wrist_pos")
-        data = {key: getattr(self, key) for n in names for key in (n, f"ref_{n}")}
-        return compute_signals(
-            data,
-            hand_active=self.hand_active.tolist(),
-            hand_object=self.hand_object.tolist(),
-            fps=self.fps,
-            num_ref_frames=self.reference_length,
-        )
-
     @property
     def reference_length(self) -> int:
         """Rows of the whole reference."""
         return self.num_frames if self.num_ref_frames < 0 else self.num_ref_frames
+
+    @property
+    def completed(self) -> bool:
+        """Reached the end of the reference without failure."""
+        # A time-out before the end of the motion is no failure, but not complete.
+        return not self.terminations and self.num_frames >= self.reference_length
+
+    def tracking_errors(self) -> TrackingErrors:
+        """Errors of the STORED states, as training saw them."""
+        names = ("object_pos", "object_quat", "fingertips", "joints", "wrist_pos")
+        return self.errors_of({name: getattr(self, name) for name in names})
+
+    def errors_of(
+        self, states: dict[str, np.ndarray | None], *, overflow: bool = False
+    ) -> TrackingErrors:
+        """Errors of any states against the reference of this rollout.
+
+        Args:
+            states: object_pos, object_quat, fingertips, joints, wrist_pos, shaped as
+                the fields of those names; None where there is none.
+            overflow: the engine warned of numerics.
+        """
+        reference = {f"ref_{name}": getattr(self, f"ref_{name}") for name in states}
+        return compute_tracking_errors(
+            states | reference,
+            hand_active=self.hand_active.tolist(),
+            hand_object=self.hand_object.tolist(),
+            fps=self.fps,
+            num_ref_frames=self.reference_length,
+            overflow=overflow,
+        )
+
+    def score(self, *, completed: bool | None = None) -> dict[str, Verdict]:
+        """Verdict of every criterion on the stored states.
+
+        Args:
+            completed: reached the end under the training terminations; None when they
+                are not known.
+        """
+        errors = self.tracking_errors()
+        return score(errors, grace=self.grace, completed=completed)
+
+    def summary(self, criterion: str) -> dict[str, Any]:
+        """What the ledger's line says of this attempt.
+
+        Args:
+            criterion: what counts as a conversion.
+        """
+        verdicts = self.score(completed=self.completed)
+        verdict = verdicts[criterion]
+        return {
+            "motion": self.motion,
+            "converted": verdict.is_passed,
+            "certified": None,
+            "criterion": criterion,
+            "errors": {k: round(v, 6) for k, v in verdict.values.items()},
+            "passed": [name for name, v in verdicts.items() if v.is_passed],
+            "completed": self.completed,
+            "hands": [SIDES[hand] for hand in np.flatnonzero(self.hand_active)],
+            "why": self.terminations or _why(verdict),
+            "frame": self.num_frames,
+            "env_steps": self.env_steps,
+        }
 
     def validate(self, *, where: str = "rollout") -> None:
         """Check shapes, JSON fields and the model hash; raise RunError on the first.
@@ -232,13 +171,18 @@ class Rollout:
             where: file name for the message.
         """
         sizes: dict[str, int] = {"T": len(self.ctrl)}
-        for key, symbols in SHAPES.items():
+        for key, hint in _hints().items():
             value = getattr(self, key)
-            if value is not None:
-                check_shape(key, np.asarray(value), symbols, sizes, where)
+            if get_origin(hint) is Annotated and value is not None:
+                _check_shape(key, value, hint.__metadata__[0], sizes, where)
         for key in ("joint_bodies", "errors", "versions", "provenance", "wrist_bodies"):
-            check_json(key, getattr(self, key), where)
-        if self.model_sha256 != xml_sha256(self.model_xml):
+            text = getattr(self, key)
+            try:
+                if text or key != "wrist_bodies":  # which may be empty
+                    json.loads(text)
+            except json.JSONDecodeError as error:
+                raise RunError(f"{where}: {key} is not JSON ({error}).") from error
+        if self.model_sha256 != _sha256(self.model_xml):
             raise RunError(
                 f"{where}: model_sha256 does not match model_xml: the model was "
                 "changed after the rollout was stored. Store the rollout again."
@@ -251,11 +195,7 @@ class Rollout:
             )
 
     def save(self, path: str | Path) -> Path:
-        """Write the file in one piece: a reader never sees half of it.
-
-        Args:
-            path: target, usually ``rollouts/<motion>.npz``.
-        """
+        """Write the file, usually ``rollouts/<motion>.npz``, in one piece."""
         self.validate(where=str(path))
         path = Path(path)
         arrays = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -266,35 +206,44 @@ class Rollout:
 
     @classmethod
     def load(cls, path: str | Path) -> Rollout:
-        """Read and check a file; every fault is a RunError that names the key.
-
-        Args:
-            path: file written by :meth:`save`.
-        """
+        """Read and check a file; every fault is a RunError that names the key."""
         data = _read(Path(path))
-        check_schema(data, path)
         required = {f.name for f in fields(cls) if f.default is MISSING}
-        known = {f.name: str(f.type) for f in fields(cls)}
         absent = sorted(required - data.keys())
         if absent:
             raise RunError(
                 f"{path}: missing keys {', '.join(absent)}. A rollout holds "
                 f"{', '.join(sorted(required))}. Store the rollout again."
             )
-        values = {k: _plain(data[k], known[k]) for k in known if k in data}
+        values: dict[str, Any] = {
+            key: data[key] if get_origin(hint) is Annotated else hint(data[key])
+            for key, hint in _hints().items()
+            if key in data
+        }
         try:
             return cls(**values)
         except RunError as error:
             raise RunError(str(error).replace("rollout:", f"{path}:", 1)) from None
 
 
-def xml_sha256(xml: str) -> str:
-    """Hash of an MJCF text.
+@cache
+def _hints() -> dict[str, Any]:
+    """Field -> str, int, float, or an array annotated with its shape."""
+    return get_type_hints(Rollout, include_extras=True)
 
-    Args:
-        xml: the text.
-    """
+
+def _sha256(xml: str) -> str:
     return hashlib.sha256(xml.encode()).hexdigest()
+
+
+def _why(verdict: Verdict) -> list[dict[str, Any]]:
+    """Which limit which hand crossed, else why there is no such number."""
+    if not verdict.blame:
+        return [{"cause": verdict.reason}] if verdict.reason else []
+    return [
+        {"cause": b.term, "hand": b.side, "value": round(b.value, 5), "frame": b.frame}
+        for b in verdict.blame
+    ]
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -302,14 +251,34 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise RunError(f"{path}: no such file. Stored rollouts end in .npz.")
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
+            data = {key: file[key] for key in file.files}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise RunError(
             f"{path}: not a readable rollout ({error}). It must be an .npz of plain "
             "arrays, without pickled objects."
         ) from error
+    if "schema" not in data:
+        raise RunError(f"{path}: missing key schema; this is not a flashdex rollout.")
+    if int(data["schema"]) != ROLLOUT_SCHEMA:
+        raise RunError(
+            f"{path}: schema {int(data['schema'])}, this version reads "
+            f"{ROLLOUT_SCHEMA}. Store the rollout again or use the matching version."
+        )
+    return data
 
 
-def _plain(value: np.ndarray, kind: str) -> Any:
-    casts = {"str": str, "int": int, "float": float}
-    return casts[kind](value) if kind in casts else value
+def _check_shape(
+    key: str, value: np.ndarray, symbols: str, sizes: dict[str, int], where: str
+) -> None:
+    """Compare a shape with its symbols; a symbol keeps the size it first had."""
+    names, shape = symbols.split(), np.shape(value)
+    fits = len(shape) == len(names) and all(
+        size == (int(name) if name.isdigit() else sizes.setdefault(name, size))
+        for name, size in zip(names, shape, strict=True)
+    )
+    if not fits:
+        known = ", ".join(f"{n}={sizes[n]}" for n in names if n in sizes)
+        raise RunError(
+            f"{where}: {key} has shape {shape}, expected ({symbols})"
+            f"{' with ' + known if known else ''}. Store the rollout again."
+        )

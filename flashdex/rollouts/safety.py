@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -15,15 +14,7 @@ GRAVITY, GRAVITY_TOLERANCE = 9.81, 0.01
 
 
 def geom_kinds(model: mujoco.MjModel, object_body: np.ndarray) -> np.ndarray:
-    """Slot of the object a geom belongs to, or HAND (moving), or SUPPORT (fixed).
-
-    Args:
-        model: compiled model.
-        object_body: body of each slot, -1 when empty, (O,).
-
-    Returns:
-        (ngeom,) int.
-    """
+    """Slot of each geom's object, or HAND (moving), or SUPPORT (fixed), (ngeom,)."""
     body = model.geom_bodyid
     kinds = np.where(model.body_weldid[body] == 0, SUPPORT, HAND)
     for slot, root in enumerate(object_body):
@@ -38,9 +29,6 @@ def assist_sources(model: mujoco.MjModel, object_body: np.ndarray) -> list[str]:
     Args:
         model: compiled model.
         object_body: body of each slot, -1 when empty, (O,).
-
-    Returns:
-        Words such as ``gravcomp``, ``actuator``, ``equality``; empty when clean.
     """
     roots = model.body_rootid[object_body[object_body >= 0]]
     in_object = np.isin(model.body_rootid, roots)
@@ -62,111 +50,73 @@ def assist_sources(model: mujoco.MjModel, object_body: np.ndarray) -> list[str]:
 
 
 def normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Normal force of every contact, from the constraint forces of the last step.
-
-    Elliptic and frictionless contacts carry it in their first row; a pyramid's edges
-    add up to it.
-
-    Args:
-        model: compiled model.
-        data: after a step.
-
-    Returns:
-        N, (ncon,); 0 for contacts that are not active.
-    """
-    contact = data.contact
-    force = np.zeros(len(contact.dist))
-    is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for i in np.flatnonzero(contact.efc_address >= 0):
-        start, dim = contact.efc_address[i], contact.dim[i]
-        width = 2 * (dim - 1) if is_pyramid and dim > 1 else 1
-        force[i] = data.efc_force[start : start + width].sum()
-    return force
+    """Normal force of every contact of the last step, N, (ncon,); 0 where inactive."""
+    wrench = np.zeros((data.ncon, 6))
+    for contact, row in enumerate(wrench):
+        mujoco.mj_contactForce(model, data, contact, row)
+    return wrench[:, 0]
 
 
-@dataclass
 class SafetyMonitor:
     """Collects peaks over all substeps; call it after every ``mj_step``.
 
     Args:
-        kinds: from :func:`geom_kinds`, (ngeom,).
-        weights: weight of each object slot, N, (O,).
+        model: compiled model.
+        object_body: body of each slot, -1 when empty, (O,).
+
     """
 
-    kinds: np.ndarray
-    weights: np.ndarray
-    penetration_hand_object: float = field(default=0.0, init=False)
-    penetration_object_support: float = field(default=0.0, init=False)
-    force_peak: float = field(default=0.0, init=False)
-    force_peak_ratio: float = field(default=0.0, init=False)
-    contacts_max: int = field(default=0, init=False)
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, object_body: np.ndarray) -> SafetyMonitor:
-        """Build from a model.
-
-        Args:
-            model: compiled model.
-            object_body: body of each slot, -1 when empty, (O,).
-        """
+    def __init__(self, model: mujoco.MjModel, object_body: np.ndarray) -> None:
         gravity = float(np.linalg.norm(model.opt.gravity))
         masses = [model.body_subtreemass[b] if b >= 0 else np.nan for b in object_body]
-        return cls(geom_kinds(model, object_body), np.array(masses) * gravity)
+        self._kinds = geom_kinds(model, object_body)
+        self._weights = np.array(masses) * gravity  # N, (O,)
+        self.peaks = {
+            "penetration_hand_object": 0.0,  # m
+            "penetration_object_support": 0.0,  # m
+            "force": 0.0,  # normal force of any contact, N
+            "force_ratio": 0.0,  # of a contact of an object, over its weight
+            "contacts": 0,
+        }
+
+    def _keep(self, name: str, values: np.ndarray) -> None:
+        self.peaks[name] = max(self.peaks[name], float(values.max(initial=0.0)))
 
     def __call__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Take in one substep.
-
-        Args:
-            model: compiled model.
-            data: after ``mj_step``.
-        """
-        self.contacts_max = max(self.contacts_max, int(data.ncon))
+        """Take in one substep."""
+        self.peaks["contacts"] = max(self.peaks["contacts"], int(data.ncon))
         if not data.ncon:
             return
         geoms = data.contact.geom
         rigid = (geoms >= 0).all(axis=1)
-        pair = np.where(rigid[:, None], self.kinds[geoms], SUPPORT)
+        pair = np.where(rigid[:, None], self._kinds[geoms], SUPPORT)
         # sorted: the object's slot, if any, is last
         pair = np.sort(pair, axis=1)
         has_object = pair[:, 1] >= 0
         depth = np.maximum(-data.contact.dist, 0.0)
-        with_hand = has_object & (pair[:, 0] == HAND)
-        with_support = has_object & (pair[:, 0] == SUPPORT)
-        self.penetration_hand_object = _peak(
-            self.penetration_hand_object, depth[with_hand]
-        )
-        self.penetration_object_support = _peak(
-            self.penetration_object_support, depth[with_support]
-        )
+        for name, kind in (("hand_object", HAND), ("object_support", SUPPORT)):
+            self._keep(f"penetration_{name}", depth[has_object & (pair[:, 0] == kind)])
         force = normal_forces(model, data)
-        self.force_peak = _peak(self.force_peak, force)
-        weight = self.weights[pair[has_object, 1]]
+        self._keep("force", force)
+        weight = self._weights[pair[has_object, 1]]
         ratio = force[has_object][weight > 0] / weight[weight > 0]
-        self.force_peak_ratio = _peak(self.force_peak_ratio, ratio)
+        self._keep("force_ratio", ratio)
 
     def to_dict(self) -> dict[str, Any]:
         """Peaks in mm and N."""
-        depths = self.penetration_hand_object, self.penetration_object_support
+        hand, support, force, ratio, contacts = self.peaks.values()
         return {
-            "penetration_max_mm": max(depths) * 1e3,
-            "penetration_hand_object_mm": depths[0] * 1e3,
-            "penetration_object_support_mm": depths[1] * 1e3,
-            "force_peak": self.force_peak,
-            "force_peak_ratio": self.force_peak_ratio,
-            "contacts_max": self.contacts_max,
+            "penetration_max_mm": max(hand, support) * 1e3,
+            "penetration_hand_object_mm": hand * 1e3,
+            "penetration_object_support_mm": support * 1e3,
+            "force_peak": force,
+            "force_peak_ratio": ratio,
+            "contacts_max": contacts,
         }
 
 
-def _peak(so_far: float, values: np.ndarray) -> float:
-    return max(so_far, float(values.max(initial=0.0)))
-
-
 def joint_limit_violations(model: mujoco.MjModel, qpos: np.ndarray) -> dict[str, Any]:
-    """Samples of limited slide and hinge joints outside their range.
-
-    Args:
-        model: compiled model.
-        qpos: (T, nq).
+    """Samples of limited slide and hinge joints outside their range, of qpos (T, nq).
 
     Returns:
         ``count`` of samples beyond the tolerance, ``max_rad``, ``max_m``.
@@ -190,19 +140,13 @@ def joint_limit_violations(model: mujoco.MjModel, qpos: np.ndarray) -> dict[str,
 def state_deviation(
     model: mujoco.MjModel, qpos: np.ndarray, stored: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Largest distance of any joint between two runs, over time.
-
-    Args:
-        model: compiled model.
-        qpos: re-simulated, (T, nq).
-        stored: of the rollout, (T, nq).
+    """Largest distance of any joint between two runs (T, nq), over time.
 
     Returns:
         Translation of slide and free joints, m, (T,); rotation of hinge, ball and free
         joints, rad, (T,).
     """
-    shift = np.zeros(len(qpos))
-    turn = np.zeros(len(qpos))
+    shift, turn = np.zeros((2, len(qpos)))
     types = mujoco.mjtJoint
     for kind, adr in zip(model.jnt_type, model.jnt_qposadr, strict=True):
         delta = qpos[:, adr] - stored[:, adr]

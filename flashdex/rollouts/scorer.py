@@ -1,4 +1,4 @@
-"""Judging attempts: in the loop, or in a process beside it.
+"""Scoring attempts: in the loop, or in a process beside it.
 
 Building, scoring, storing and certifying a rollout takes the host ten to a thousand
 milliseconds. On the cpu that is little against the physics; a GPU would stand still.
@@ -6,7 +6,6 @@ milliseconds. On the cpu that is little against the physics; a GPU would stand s
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing as mp
 import os
 import signal
@@ -15,12 +14,15 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+import torch
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.rollouts.build import AttemptMaker
-from flashdex.rollouts.ledger import Conversion, Ledger
+from flashdex.rollouts.build import RolloutBuilder
+from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode
 
 if TYPE_CHECKING:
@@ -29,132 +31,88 @@ if TYPE_CHECKING:
 MAX_PENDING = 512  # episodes in line, a megabyte each; then the loop waits
 
 
-class Judging(Protocol):
-    """Takes episodes in and gives first conversions out, in the order of episodes."""
+class InlineScorer:
+    """Scores at once."""
 
-    @property
-    def pending(self) -> int:
-        """Episodes that are not judged yet."""
-        ...
+    pending = 0  # episodes that are not scored yet
 
-    def submit(self, episode: Episode, wall_s: float) -> None:
-        """Hand over one finished episode.
+    def __init__(self, ledger: Ledger, builder: RolloutBuilder) -> None:
+        self.ledger, self.builder = ledger, builder
+        self._converted: list[str] = []
 
-        Args:
-            episode: of an attempt world.
-            wall_s: seconds of the run.
-        """
-        ...
+    def submit(self, episode: Episode, wall_s: float) -> dict[str, Any]:
+        """Score a finished episode at so many seconds of the run; return its line."""
+        rollout = self.builder.build(episode)
+        line, is_first = self.ledger.record(rollout, wall_s=wall_s)
+        if is_first:
+            self._converted.append(rollout.motion)
+        return line
 
-    def collect(self, *, wait: bool = False) -> list[Conversion]:
-        """First conversions since the last call.
-
-        Args:
-            wait: until all episodes are judged and their lines written.
-
-        Raises:
-            OSError: a file could not be written.
-            RunError: the judging process has died.
-        """
-        ...
-
-    def close(self, *, wait: bool = True) -> None:
-        """End.
-
-        Args:
-            wait: judge what is in line first.
-        """
-        ...
-
-
-class JudgeHere:
-    """Judges at once.
-
-    Args:
-        ledger: writes the lines.
-        maker: builds the rollouts.
-    """
-
-    pending = 0
-
-    def __init__(self, ledger: Ledger, maker: AttemptMaker) -> None:
-        self.ledger, self.maker = ledger, maker
-        self._found: list[Conversion] = []
-
-    def submit(self, episode: Episode, wall_s: float) -> None:
-        """See ``Judging.submit``."""
-        attempt = self.maker.make(episode)
-        steps = episode.env_steps
-        found = self.ledger.record(attempt, env_steps=steps, wall_s=wall_s)
-        if found is not None:
-            self._found.append(found)
-
-    def collect(self, *, wait: bool = False) -> list[Conversion]:
-        """See ``Judging.collect``."""
-        found, self._found = self._found, []
-        return found
+    def collect(self, *, wait: bool = False) -> list[str]:
+        """Motions whose first passing attempt was found since the last call."""
+        converted, self._converted = self._converted, []
+        return converted
 
     def close(self, *, wait: bool = True) -> None:
         """Nothing is in line."""
 
 
-@dataclasses.dataclass(frozen=True)
-class JudgeOrder:
-    """What the judging process builds its own ledger and maker from.
+@dataclass(frozen=True)
+class ScorerSpec:
+    """What the scoring process builds its own scorer from."""
 
-    Attributes:
-        recipe: of the run, with the library that is in use.
-        run_dir: run directory.
-        made_by: engine, versions and hardware of the states.
-        provenance: stored with every rollout.
-        trivial: motions that a baseline already passes.
-        on_gpu: a GPU steps the physics.
-    """
-
-    recipe: Recipe
+    recipe: Recipe  # of the run, with the library that is in use
     run_dir: Path
-    made_by: dict[str, Any]
-    provenance: dict[str, str]
-    trivial: dict[str, list[str]]
-    on_gpu: bool = False
+    made_by: dict[str, Any]  # engine, versions and hardware of the states
+    provenance: dict[str, str]  # stored with every rollout
+    trivial: dict[str, list[str]]  # motions that a baseline already passes
+    on_gpu: bool = False  # a GPU steps the physics
 
 
-Start = Callable[[JudgeOrder], tuple[Ledger, AttemptMaker]]
+MakeScorer = Callable[[ScorerSpec], InlineScorer]
 
 
-class JudgeBeside:
-    """Judges in a process of its own, which writes all lines and rollouts.
+class ProcessScorer:
+    """Scores in a process of its own, which writes all lines and rollouts.
 
     Args:
         ledger: follows what the process writes; it must write nothing meanwhile.
-        order: for the process.
-        start: what the process runs first, to build ledger and maker from the order.
+        spec: for the process.
+        make: what the process runs first.
     """
 
-    def __init__(self, ledger: Ledger, order: JudgeOrder, start: Start) -> None:
+    def __init__(self, ledger: Ledger, spec: ScorerSpec, make: MakeScorer) -> None:
         self.ledger = ledger
         # A fork would share the GPU's state. One process: lines keep their order.
         self._pool = ProcessPoolExecutor(
-            1, mp_context=mp.get_context("spawn"), initializer=_begin
+            1, mp_context=mp.get_context("spawn"), initializer=_live_with_parent
         )
-        self._opened: Future[None] | None = self._pool.submit(_open, order, start)
+        self._opened: Future[None] | None = self._pool.submit(_open, spec, make)
         self._line: deque[Future[dict[str, Any]]] = deque()
 
     @property
     def pending(self) -> int:
-        """Episodes that are not judged yet."""
+        """Episodes that are not scored yet."""
         return len(self._line)
 
     def submit(self, episode: Episode, wall_s: float) -> None:
-        """See ``Judging.submit``."""
+        """Hand over a finished episode at so many seconds of the run."""
         try:
-            self._line.append(self._pool.submit(_judge, episode, wall_s))
+            self._line.append(self._pool.submit(_score, episode, wall_s))
         except BrokenProcessPool as error:
             raise self._died() from error
 
-    def collect(self, *, wait: bool = False) -> list[Conversion]:
-        """See ``Judging.collect``."""
-        found = []
+    def collect(self, *, wait: bool = False) -> list[str]:
+        """Motions whose first passing attempt was found since the last call.
+
+        Args:
+            wait: until all episodes are scored and their lines written.
+
+        Raises:
+            OSError: a file could not be written.
+            RunError: the scoring process has died.
+        """
+        converted = []
         enough = 0 if wait else MAX_PENDING
         while self._line and (len(self._line) > enough or self._line[0].done()):
             try:
@@ -165,9 +123,9 @@ class JudgeBeside:
             except BrokenProcessPool as error:
                 raise self._died() from error
             self._line.popleft()
-            if (conversion := self.ledger.take(line)) is not None:
-                found.append(conversion)
-        return found
+            if self.ledger.count(line):
+                converted.append(line["motion"])
+        return converted
 
     def _died(self) -> RunError:
         return RunError(
@@ -179,7 +137,7 @@ class JudgeBeside:
         )
 
     def close(self, *, wait: bool = True) -> None:
-        """See ``Judging.close``."""
+        """End; ``wait`` to score what is in line first."""
         try:
             if wait:
                 self.collect(wait=True)
@@ -187,10 +145,13 @@ class JudgeBeside:
             self._pool.shutdown(wait=wait, cancel_futures=True)
 
 
-_open_parts: list[tuple[Ledger, AttemptMaker]] = []  # of the judging process
+Scorer = InlineScorer | ProcessScorer
+"""Takes episodes in and says which motions converted, in the order of episodes."""
+
+_opened: list[InlineScorer] = []  # of the scoring process
 
 
-def _begin() -> None:
+def _live_with_parent() -> None:
     """First thing in the process: live and die with the loop."""
     # A signal to the whole group ends the loop, which ends this in order.
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
@@ -206,19 +167,13 @@ def _follow_parent() -> None:
         os._exit(1)  # nobody waits for the rest
 
 
-def _open(order: JudgeOrder, start: Start) -> None:
-    import torch
-
+def _open(spec: ScorerSpec, make: MakeScorer) -> None:
     torch.set_num_threads(1)
     try:
-        _open_parts.append(start(order))
+        _opened.append(make(spec))
     except FlashdexError as error:
         raise RunError(str(error)) from None  # others may not travel between processes
 
 
-def _judge(episode: Episode, wall_s: float) -> dict[str, Any]:
-    """Judge one episode; return its line, which is in the file."""
-    ledger, maker = _open_parts[0]
-    attempt = maker.make(episode)
-    ledger.record(attempt, env_steps=episode.env_steps, wall_s=wall_s)
-    return ledger.last_line
+def _score(episode: Episode, wall_s: float) -> dict[str, Any]:
+    return _opened[0].submit(episode, wall_s)

@@ -18,9 +18,13 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
 from flashdex.replay.disk import ReplayLog, replay_of
-from flashdex.rollouts.build import AttemptMaker
 from flashdex.rollouts.ledger import Ledger
-from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder, Judging
+from flashdex.rollouts.scorer import (
+    InlineScorer,
+    ProcessScorer,
+    Scorer,
+    ScorerSpec,
+)
 from flashdex.system.files import write_atomic
 from flashdex.system.machine import versions
 from flashdex.training.baselines import score_baselines
@@ -79,14 +83,14 @@ def make_trainer(
         env_steps=start.env_steps,
     )
     replay = _open_replay(bench, run_dir, learner, state)
-    judging = _make_judging(bench, run_dir, env, ledger)
+    scorer = _make_scorer(bench, run_dir, env, ledger)
     trainer = Trainer(
         recipe,
         run_dir,
         env,
         learner,
         ledger,
-        judging,
+        scorer,
         log,
         start=start,
         replay=replay,
@@ -112,20 +116,20 @@ def _open_ledger(
     )
 
 
-def _make_judging(
+def _make_scorer(
     bench: Workbench, run_dir: Path, env: TrackingEnv, ledger: Ledger
-) -> Judging:
+) -> Scorer:
     """In the loop, or in a process where the physics would wait for it."""
     recipe, provenance = bench.recipe, _provenance(bench)
     made_by = versions(recipe.physics.engine, env.device)
     where = recipe.train.judge
     if where == "inline" or (where == "auto" and env.is_host_device):
         scenes = env.physics.scenes
-        maker = bench.attempt_maker(scenes, made_by=made_by, provenance=provenance)
-        return JudgeHere(ledger, maker)
+        builder = bench.rollout_builder(scenes, made_by=made_by, provenance=provenance)
+        return InlineScorer(ledger, builder)
     # The process must not prepare the motions again: name the library that is used.
     motions = dataclasses.replace(recipe.motions, library=str(bench.library.path))
-    order = JudgeOrder(
+    spec = ScorerSpec(
         dataclasses.replace(recipe, motions=motions),
         run_dir,
         made_by,
@@ -133,22 +137,22 @@ def _make_judging(
         ledger.trivial,
         ledger.on_gpu,
     )
-    return JudgeBeside(ledger, order, start_judge)
+    return ProcessScorer(ledger, spec, make_inline_scorer)
 
 
-def start_judge(order: JudgeOrder) -> tuple[Ledger, AttemptMaker]:
-    """Build ledger and maker in the judging process.
+def make_inline_scorer(spec: ScorerSpec) -> InlineScorer:
+    """Build the scorer of the scoring process.
 
     Args:
-        order: what the run told it.
+        spec: what the run told it.
     """
-    bench = open_workbench(order.recipe, device=torch.device("cpu"))
-    scenes = build_scenes(bench.library, bench.hands, order.recipe.physics)
-    maker = bench.attempt_maker(
-        scenes, made_by=order.made_by, provenance=order.provenance
+    bench = open_workbench(spec.recipe, device=torch.device("cpu"))
+    scenes = build_scenes(bench.library, bench.hands, spec.recipe.physics)
+    builder = bench.rollout_builder(
+        scenes, made_by=spec.made_by, provenance=spec.provenance
     )
-    ledger = _open_ledger(bench, order.run_dir, order.trivial, on_gpu=order.on_gpu)
-    return ledger, maker
+    ledger = _open_ledger(bench, spec.run_dir, spec.trivial, on_gpu=spec.on_gpu)
+    return InlineScorer(ledger, builder)
 
 
 def _provenance(bench: Workbench) -> dict[str, str]:

@@ -73,10 +73,10 @@ def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
     for name, target in BASELINES.items():
         criterion = bench.recipe.train.criterion
         rows[name] = {}
-        for attempt in roll_all(bench, idle, target=target):
-            verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
+        for rollout in roll_all(bench, idle, target=target):
+            verdicts = rollout.score()
             verdict = verdicts[criterion]
-            rows[name][attempt.rollout.motion] = {
+            rows[name][rollout.motion] = {
                 "passed": [k for k, v in verdicts.items() if v.is_passed],
                 "state": verdict.state,
                 "errors": {k: round(v, 5) for k, v in verdict.values.items()},
@@ -96,14 +96,14 @@ def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
         frames = torch.arange(int(bank.length[row]))
         ref = bank.at(torch.full_like(frames, row), frames)
         slots = torch.where(bank.has_object[row], bank.hand_slot[row], -1)
-        signals = frozen_object(
+        errors = frozen_object(
             ref["object_pos"].double(),
             ref["object_quat"].double(),
             hand_active=bank.hand_active[row].tolist(),
             hand_object=slots.tolist(),
             fps=bank.fps,
         )
-        verdicts = score(signals, grace=grace_steps(bank.fps))
+        verdicts = score(errors, grace=grace_steps(bank.fps))
         verdict = verdicts[criterion]
         out[name] = {
             "passed": [k for k, v in verdicts.items() if v.is_passed],

@@ -33,7 +33,7 @@ from flashdex.motions.library import MotionLibrary
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
-from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.build import RolloutBuilder
 from flashdex.system.machine import versions
 
 
@@ -205,13 +205,13 @@ class Workbench:
             return self.bank
         return ReferenceBank(self.library, self.hands).to(device)
 
-    def attempt_maker(
+    def rollout_builder(
         self,
         scenes: list[Scene],
         *,
         made_by: dict[str, Any] | None = None,
         provenance: dict[str, str] | None = None,
-    ) -> AttemptMaker:
+    ) -> RolloutBuilder:
         """Build what turns episodes into rollouts.
 
         Args:
@@ -221,7 +221,7 @@ class Workbench:
             provenance: stored with every rollout.
         """
         recipe, device = self.recipe, self.bank.table.device
-        return AttemptMaker(
+        return RolloutBuilder(
             self.bank_on(torch.device("cpu")),
             self.hands,
             scenes,

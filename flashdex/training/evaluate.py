@@ -12,7 +12,6 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.aggregate import mean_object_errors, mope_more
-from flashdex.metrics.criteria import score
 from flashdex.system.files import write_atomic
 from flashdex.training.assemble import restore
 from flashdex.training.build import open_workbench
@@ -60,22 +59,21 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> Evaluation:
         return learner.act(td.to(learner.device), explore=False)
 
     criterion = recipe.train.criterion
-    attempts = roll_all(bench, act, env_steps=state["env_steps"])
     rows, errors = [], []
-    for attempt in attempts:
-        signals = attempt.rollout.signals()
-        verdicts = score(signals, grace=attempt.rollout.grace)
+    for rollout in roll_all(bench, act, env_steps=state["env_steps"]):
+        verdicts = rollout.score()
         wanted = dict.fromkeys([criterion, *SHOWN])
         rows.append(
             {
-                "motion": attempt.rollout.motion,
+                "motion": rollout.motion,
                 **{name: verdicts[name].state for name in wanted},
                 "errors": {
                     k: round(v, 5) for k, v in verdicts[criterion].values.items()
                 },
             }
         )
-        errors.append((mean_object_errors(signals), verdicts["sr_spider_centred"]))
+        mean = mean_object_errors(rollout.tracking_errors())
+        errors.append((mean, verdicts["sr_spider_centred"]))
     totals: dict[str, Any] = {"env_steps": state["env_steps"], **mope_more(errors)}
     for name in dict.fromkeys([criterion, *SHOWN]):
         states = [row[name] for row in rows]

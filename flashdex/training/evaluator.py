@@ -15,8 +15,8 @@ from flashdex.algorithms.base import Learner
 from flashdex.envs.gym import GymWorlds
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import GymRecipe
-from flashdex.rollouts.build import Attempt
-from flashdex.rollouts.recorder import AttemptRing
+from flashdex.rollouts.recorder import EpisodeRecorder
+from flashdex.rollouts.rollout import Rollout
 from flashdex.training.build import Workbench
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]
@@ -30,7 +30,7 @@ def roll_all(
     env_steps: int = 0,
     worlds: int = 32,
     target: Callable[[TrackingEnv], Tensor] | None = None,
-) -> list[Attempt]:
+) -> list[Rollout]:
     """Roll every motion once from frame 0, without assist, noise or terminations.
 
     Args:
@@ -42,10 +42,10 @@ def roll_all(
             controllers outside the action space.
 
     Returns:
-        One attempt a motion, in library order.
+        One rollout a motion, in library order.
     """
     total = bench.bank.num_motions
-    out: list[Attempt] = []
+    out: list[Rollout] = []
     for first in range(0, total, worlds):
         rows = torch.arange(first, min(first + worlds, total))
         out += _roll(bench, controller, rows, env_steps, target)
@@ -59,26 +59,24 @@ def _roll(
     rows: Tensor,
     env_steps: int,
     target: Callable[[TrackingEnv], Tensor] | None,
-) -> list[Attempt]:
+) -> list[Rollout]:
     env = bench.make_env(num_envs=len(rows), evaluation=True)
     env.forced_motion = rows.to(env.device)
     env.target_override = target
-    ring, maker = (
-        AttemptRing(env, look_every=1),
-        bench.attempt_maker(env.physics.scenes),
-    )
+    recorder = EpisodeRecorder(env, look_every=1)
+    builder = bench.rollout_builder(env.physics.scenes)
     td = env.reset()
-    ring.begin()
-    found: dict[int, Attempt] = {}
+    recorder.record_start()
+    found: dict[int, Rollout] = {}
     while len(found) < len(rows):
         action = controller(td, env)
         env.put_action(td, action)
         done = env.step(td)["next", keys.DONE]
-        for episode in ring.step(action, done, env_steps):
+        for episode in recorder.record_step(action, done, env_steps):
             if episode.motion not in found:  # short motions begin again
-                found[episode.motion] = maker.make(episode)
+                found[episode.motion] = builder.build(episode)
         td = env.reset_worlds(done.squeeze(-1))
-        ring.begin()
+        recorder.record_start()
     return [found[r] for r in rows.tolist()]
 
 

@@ -193,7 +193,7 @@ def _train(
     try:
         why = trainer.run()
     finally:
-        trainer.judging.close(wait=why != "error")
+        trainer.scorer.close(wait=why != "error")
         trainer.log.close()
         with contextlib.suppress(OSError):  # the disk may be what ended it
             end_session(

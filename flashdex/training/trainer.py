@@ -25,8 +25,8 @@ from flashdex.modules.layers import restore_generator
 from flashdex.recipe import Recipe, dump_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.rollouts.ledger import Ledger
-from flashdex.rollouts.recorder import AttemptRing, Episode
-from flashdex.rollouts.scorer import Judging
+from flashdex.rollouts.recorder import Episode, EpisodeRecorder
+from flashdex.rollouts.scorer import Scorer
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
@@ -54,7 +54,7 @@ def make_record(
     env: TrackingEnv,
     learner: Learner,
     ledger: Ledger,
-    judging: Judging,
+    scorer: Scorer,
 ) -> dict[str, float]:
     """What a log record says besides the running means.
 
@@ -65,7 +65,7 @@ def make_record(
         env: for the assist and the engine's overflow, which is read and cleared.
         learner: for updates and buffer.
         ledger: for conversions.
-        judging: for the attempts in line.
+        scorer: for the attempts in line.
     """
     record: dict[str, float] = {
         "env_steps": env_steps,
@@ -73,7 +73,7 @@ def make_record(
         "hours": wall_s / 3600,
         "updates": learner.updates,
         **ledger.metrics(wall_s / 3600),
-        "convert/pending": judging.pending,
+        "convert/pending": scorer.pending,
         "buffer/rows": learner.num_rows,
         "buffer/dropped": float(getattr(learner, "num_dropped", 0)),
         "assist/level": env.assist.upper[0] if env.assist is not None else 0.0,
@@ -251,7 +251,7 @@ class Trainer:
         env: tracking environment.
         learner: acts and learns.
         ledger: what was achieved.
-        judging: judges attempts for the ledger.
+        scorer: scores attempts for the ledger.
         log: metric writers.
         start: where the session begins.
         replay: stores replay rows with the checkpoints, or None.
@@ -264,7 +264,7 @@ class Trainer:
         env: TrackingEnv,
         learner: Learner,
         ledger: Ledger,
-        judging: Judging,
+        scorer: Scorer,
         log: MetricLog,
         *,
         start: Start,
@@ -273,7 +273,7 @@ class Trainer:
         self.recipe, self.run_dir, self.env = recipe, run_dir, env
         self.learner, self.ledger, self.log = learner, ledger, log
         self.start, self.replay = start, replay
-        self.judging, self.attempts = judging, AttemptRing(env)
+        self.scorer, self.recorder = scorer, EpisodeRecorder(env)
         self.stats = RunningStats()
         self.assist_epoch = AssistEpoch(env.terms.gates)
         self.guard = GradientGuard()
@@ -321,7 +321,7 @@ class Trainer:
     def _loop(self) -> str:
         train, total = self.recipe.train, self.recipe.total_env_steps
         td = self.env.reset()
-        self.attempts.begin()
+        self.recorder.record_start()
         self._last_log = last_save = time.monotonic()
         bar = Progress(self.recipe.name, total=total, done=self.env_steps)
         try:
@@ -356,7 +356,7 @@ class Trainer:
             self.vector_steps += 1
             terminated, done = after[keys.TERMINATED], after[keys.DONE]
             with self.stats.time("judge"):
-                self._judge(self.attempts.step(action, done, self.env_steps))
+                self._judge(self.recorder.record_step(action, done, self.env_steps))
         with self.stats.time("remember"):
             self._remember(td, action)
         if not self.learner.is_off_policy:
@@ -371,7 +371,7 @@ class Trainer:
         if self.env.is_host_device and not done.any():
             return step_mdp(td)
         td = self.env.reset_worlds(done.squeeze(-1))
-        self.attempts.begin()
+        self.recorder.record_start()
         return td
 
     def _remember(self, td: TensorDictBase, action: Tensor) -> None:
@@ -388,14 +388,14 @@ class Trainer:
 
     def _judge(self, episodes: list[Episode], *, wait: bool = False) -> None:
         for episode in episodes:
-            self.judging.submit(episode, self.wall_s)
-        for conversion in self.judging.collect(wait=wait):
-            self._mark_converted(conversion.motion)
+            self.scorer.submit(episode, self.wall_s)
+        for motion in self.scorer.collect(wait=wait):
+            self._mark_converted(motion)
 
     def _settle(self) -> RunError | None:
         """Judge all attempts so far; what was learnt is not lost with the judge."""
         try:
-            self._judge(self.attempts.look(), wait=True)
+            self._judge(self.recorder.finished(), wait=True)
         except RunError as error:
             return error
         return None
@@ -435,7 +435,7 @@ class Trainer:
             env=self.env,
             learner=self.learner,
             ledger=self.ledger,
-            judging=self.judging,
+            scorer=self.scorer,
         )
         record.update(self.stats.pop(seconds, self.env.num_envs))
         self._last_record = {k: float(v) for k, v in record.items()}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from flashdex.metrics.errors import compute_signals
+from flashdex.metrics.errors import compute_tracking_errors
 
 
 def turn_z(angle):
@@ -14,7 +14,7 @@ def turn_z(angle):
 
 @pytest.fixture
 def poses():
-    """Build signals of moving objects whose errors are given, one column a slot."""
+    """Build tracking errors of moving objects: those given, one column a slot."""
 
     def build(
         pos_error, rot_error=None, *, moving=None, tips=None, joints=None, **masks
@@ -46,6 +46,6 @@ def poses():
             "hand_active": (slots == 2, True),
             "hand_object": (0, 1) if slots == 2 else (-1, 0),
         } | masks
-        return compute_signals(data, **masks)
+        return compute_tracking_errors(data, **masks)
 
     return build

@@ -7,7 +7,7 @@ import torch
 
 from flashdex.errors import UnknownNameError
 from flashdex.metrics.criteria import resolve_criterion, score
-from flashdex.metrics.errors import Signals
+from flashdex.metrics.errors import TrackingErrors
 
 T, GRACE = 47, 15
 DEG = math.pi / 180
@@ -27,7 +27,7 @@ def signals(**values):
     offset[:, 1, 1] += sway * torch.tensor([(-1.0) ** t for t in range(T)])
     ref = torch.zeros(T, 2, 3, dtype=torch.float64)
     ref[:, :, 2] = torch.linspace(0, 0.5, T)[:, None]
-    return Signals(
+    return TrackingErrors(
         object_pos_offset=offset,
         object_rot_error=field("object_rot"),
         ref_object_pos=ref,

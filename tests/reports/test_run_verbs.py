@@ -61,7 +61,7 @@ def test_score_json_agrees_with_the_library(call, run_dir, rollout):
     assert code == 0
     found = json.loads(out)[str(path)]
     loaded = Rollout.load(path)
-    expected = score(loaded.signals(), grace=loaded.grace)
+    expected = score(loaded.tracking_errors(), grace=loaded.grace)
     assert list(found) == list(expected)
     for name, verdict in expected.items():
         assert found[name]["state"] == verdict.state

@@ -2,7 +2,6 @@
 
 import json
 
-from flashdex.metrics.criteria import score
 from flashdex.reports.run.terminal import (
     evaluation_table,
     run_table,
@@ -93,7 +92,7 @@ def test_evaluation():
 
 
 def test_scores_show_value_and_limit(rollout):
-    text = score_table("push.npz", score(rollout.signals(), grace=rollout.grace))
+    text = score_table("push.npz", rollout.score())
     lines = {line.split()[0]: line for line in text.splitlines()}
     assert "passed" in lines["sr_mt_obj"]
     assert "object 5.0/30 mm, object 0.0/30 deg" in lines["sr_mt_obj"]

@@ -9,7 +9,7 @@ import pytest
 from flashdex.errors import RunError, UnknownNameError
 from flashdex.metrics.criteria_table import criterion_names
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.perturbation import Perturbation
+from flashdex.rollouts.resimulation import Perturbation
 from flashdex.rollouts.rollout import Rollout
 
 
@@ -72,7 +72,7 @@ def test_static_box_survives_every_perturbation(build_rollout):
 def test_perturbations_beyond_the_limits_are_certified_not_robust(build_rollout):
     still = build_rollout(push=0.0, criterion="sr_mt_obj_x0.5")
     # first pose off by up to 10 cm per axis against a limit of 1.5 cm
-    certificate = certify(still, settings=Perturbation(object_pos=0.1))
+    certificate = certify(still, sizes=Perturbation(object_pos=0.1))
     assert certificate.verdict == "certified"
     assert certificate.perturbed["pass_fraction"]["sr_mt_obj_x0.5"] < 0.75
     failing = [
@@ -89,7 +89,7 @@ def test_six_of_eight_is_the_line(rollout):
 
     nominal = certify(rollout, num_perturbations=0)
     assert nominal.verdict == "certified"
-    passed = module.score(rollout.signals())["sr_mt"]
+    passed = rollout.score()["sr_mt"]
     failed = replace(passed, state="failed", reason="limit")
     for count, verdict in ((5, "certified"), (6, "robust"), (8, "robust")):
         runs = [passed] * count + [failed] * (8 - count)

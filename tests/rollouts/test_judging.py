@@ -15,18 +15,18 @@ from flashdex import keys
 from flashdex.errors import RunError
 from flashdex.recipe import MotionsConfig
 from flashdex.rollouts.ledger import CONVERSIONS, Ledger
-from flashdex.rollouts.recorder import AttemptRing
-from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder
+from flashdex.rollouts.recorder import EpisodeRecorder
+from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, ScorerSpec
 from flashdex.system.jsonl import read_lines
 from flashdex.system.machine import versions
-from flashdex.training.assemble import start_judge
+from flashdex.training.assemble import make_inline_scorer
 
 
-def die(order):
+def die(spec):
     os._exit(7)
 
 
-def cannot_write(order):
+def cannot_write(spec):
     raise OSError(28, "No space left on device")
 
 
@@ -42,17 +42,17 @@ def bench(make_bench, library):
 def episodes(bench):
     """Finished episodes of shaky hands, and the scenes they took place in."""
     env = bench.make_env()
-    ring, found = AttemptRing(env), []
+    recorder, found = EpisodeRecorder(env), []
     generator = torch.Generator().manual_seed(0)
     td = env.reset()
-    ring.begin()
+    recorder.record_start()
     for step in range(90):
         action = 0.4 * (2 * torch.rand(6, 2, 18, generator=generator) - 1)
         env.put_action(td, action)
         done = env.step(td)["next", keys.DONE]
-        found += ring.step(action, done, step)
+        found += recorder.record_step(action, done, step)
         td = env.reset_worlds(done.squeeze(-1))
-        ring.begin()
+        recorder.record_start()
     assert len(found) > 6
     return found, env.physics.scenes
 
@@ -68,23 +68,23 @@ def make_ledger(bench, folder):
     )
 
 
-def beside(bench, folder, start=start_judge):
-    order = JudgeOrder(bench.recipe, folder, versions(), {"date": "today"}, {})
-    return JudgeBeside(make_ledger(bench, folder), order, start)
+def beside(bench, folder, make=make_inline_scorer):
+    spec = ScorerSpec(bench.recipe, folder, versions(), {"date": "today"}, {})
+    return ProcessScorer(make_ledger(bench, folder), spec, make)
 
 
 def test_both_ways_write_the_same_lines(bench, episodes, tmp_path):
     found, scenes = episodes
-    maker = bench.attempt_maker(
+    builder = bench.rollout_builder(
         scenes, made_by=versions(), provenance={"date": "today"}
     )
-    here = JudgeHere(make_ledger(bench, tmp_path / "here"), maker)
+    here = InlineScorer(make_ledger(bench, tmp_path / "here"), builder)
     there = beside(bench, tmp_path / "there")
     conversions = [[], []]
     for number, episode in enumerate(found):
-        for judging, list_ in zip((here, there), conversions, strict=True):
-            judging.submit(episode, 0.5 * number)
-            list_ += judging.collect()
+        for scorer, list_ in zip((here, there), conversions, strict=True):
+            scorer.submit(episode, 0.5 * number)
+            list_ += scorer.collect()
     conversions[1] += there.collect(wait=True)
     assert there.pending == 0
     there.close()
@@ -92,25 +92,25 @@ def test_both_ways_write_the_same_lines(bench, episodes, tmp_path):
     lines = [list(x) for x in lines]
     assert lines[0] == lines[1]
     assert len(lines[0]) == len(found)
-    assert [c.motion for c in conversions[0]] == [c.motion for c in conversions[1]]
+    assert conversions[0] == conversions[1]
     assert here.ledger.metrics(1.0) == there.ledger.metrics(1.0)
     assert here.ledger.num_bytes == there.ledger.num_bytes
 
 
 def test_a_process_that_dies_is_noticed(bench, episodes, tmp_path):
-    judging = beside(bench, tmp_path, die)
-    judging.submit(episodes[0][0], 1.0)
+    scorer = beside(bench, tmp_path, die)
+    scorer.submit(episodes[0][0], 1.0)
     with pytest.raises(RunError, match="died with 1 of them"):
-        judging.collect(wait=True)
-    judging.close(wait=False)
+        scorer.collect(wait=True)
+    scorer.close(wait=False)
 
 
 def test_an_error_of_the_process_is_that_of_the_loop(bench, episodes, tmp_path):
-    judging = beside(bench, tmp_path, cannot_write)
-    judging.submit(episodes[0][0], 1.0)
+    scorer = beside(bench, tmp_path, cannot_write)
+    scorer.submit(episodes[0][0], 1.0)
     with pytest.raises(OSError, match="No space left"):
-        judging.collect(wait=True)
-    judging.close(wait=False)
+        scorer.collect(wait=True)
+    scorer.close(wait=False)
 
 
 ENDS = """
@@ -121,22 +121,23 @@ sys.path[:0] = {folders!r}
 import numpy as np
 from test_judging import cannot_write, die
 from flashdex.rollouts.recorder import Episode
-from flashdex.rollouts.scorer import JudgeBeside, JudgeOrder
+from flashdex.rollouts.scorer import ProcessScorer, ScorerSpec
 
 if __name__ == "__main__":
-    start = {{"die": die, "error": cannot_write, "backlog": die}}[sys.argv[1]]
+    make = {{"die": die, "error": cannot_write, "backlog": die}}[sys.argv[1]]
     ledger = SimpleNamespace(path=Path('run') / 'lines')
-    judging = JudgeBeside(ledger, JudgeOrder(None, None, {{}}, {{}}, {{}}), start)
+    spec = ScorerSpec(None, None, {{}}, {{}}, {{}})
+    scorer = ProcessScorer(ledger, spec, make)
     state = np.zeros(3)
     wide = {{"qpos": np.zeros((2000, 100))}}
     try:
         for _ in range(20):
-            judging.submit(Episode(0, 0, wide, state, state, 0, 0, {{}}), 0.0)
+            scorer.submit(Episode(0, 0, wide, state, state, 0, 0, {{}}), 0.0)
         if sys.argv[1] != "backlog":
-            judging.collect(wait=True)
+            scorer.collect(wait=True)
     except Exception as error:
         print(type(error).__name__)
-    judging.close(wait=False)
+    scorer.close(wait=False)
     print("closed")
 """
 

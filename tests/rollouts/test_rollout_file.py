@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from flashdex.errors import RunError
-from flashdex.metrics.criteria import score
 from flashdex.rollouts.rollout import Rollout
 
 
@@ -41,11 +40,11 @@ def test_optional_arrays_survive(build_rollout, tmp_path):
     again = Rollout.load(rollout.save(tmp_path / "a.npz"))
     np.testing.assert_array_equal(again.wrist_pos, wrist)
     assert again.reference_length == 91
-    assert score(again.signals())["chord_sr"].state == "passed"
+    assert again.score()["chord_sr"].state == "passed"
 
 
-def test_stored_signals_are_scored_without_the_library(stored):
-    scores = score(Rollout.load(stored).signals())
+def test_stored_states_are_scored_without_the_library(stored):
+    scores = Rollout.load(stored).score()
     assert scores["sr_mt"].state == "passed"
     assert scores["sr_mt"].values["joint"] == 0.0
     assert scores["sr_mt_right"].reason == "hand_absent"

@@ -1,16 +1,19 @@
 """Penetration, force, limits, deviation and perturbations against closed forms."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
-from flashdex.rollouts.perturbation import (
+from flashdex.rollouts.resimulation import (
     Perturbation,
     control_range,
+    load_simulation,
     perturb,
-    perturb_state,
+    perturb_objects,
+    resimulate,
 )
-from flashdex.rollouts.resimulation import load_scene, resimulate
 from flashdex.rollouts.safety import (
     SafetyMonitor,
     geom_kinds,
@@ -43,9 +46,9 @@ def test_normal_forces_agree_with_mujoco_and_carry_the_weight(scene_xml, cone):
 
 def test_penetration_of_a_settling_box_is_how_deep_it_sinks(build_rollout):
     rollout = build_rollout(push=0.0)
-    scene = load_scene(rollout)
-    monitor = SafetyMonitor.of(scene.model, scene.object_body)
-    resimulate(scene, rollout, monitor=monitor)
+    sim = load_simulation(rollout)
+    monitor = SafetyMonitor(sim.model, sim.object_body)
+    resimulate(sim, monitor=monitor)
     report = monitor.to_dict()
     # oracle: a flat box is as deep as its centre is below half its height
     model = mujoco.MjModel.from_xml_string(rollout.model_xml)
@@ -66,24 +69,24 @@ def test_penetration_of_a_settling_box_is_how_deep_it_sinks(build_rollout):
 
 
 def test_first_pose_inside_the_box_shows_as_hand_penetration(rollout):
-    scene = load_scene(rollout)
-    monitor = SafetyMonitor.of(scene.model, scene.object_body)
+    sim = load_simulation(rollout)
+    monitor = SafetyMonitor(sim.model, sim.object_body)
     qpos0 = rollout.qpos0.copy()
     # palm face at -.10 + q, box face at -.03
     qpos0[0] = 0.07 + 0.004
-    resimulate(scene, rollout, qpos0=qpos0, monitor=monitor)
+    resimulate(replace(sim, qpos0=qpos0), monitor=monitor)
     # the tip's sphere is 5 mm ahead of the palm
-    assert monitor.penetration_hand_object == pytest.approx(0.009, rel=0.05)
-    assert monitor.force_peak_ratio > 1.0
+    assert monitor.peaks["penetration_hand_object"] == pytest.approx(0.009, rel=0.05)
+    assert monitor.peaks["force_ratio"] > 1.0
 
 
 def test_geoms_are_sorted_into_object_hand_and_support(rollout):
-    scene = load_scene(rollout)
-    assert geom_kinds(scene.model, scene.object_body).tolist() == [-2, -1, -1, 0]
+    sim = load_simulation(rollout)
+    assert geom_kinds(sim.model, sim.object_body).tolist() == [-2, -1, -1, 0]
 
 
 def test_joint_limits_count_samples_beyond_the_tolerance(rollout):
-    model = load_scene(rollout).model  # slide, range -.05 to .6
+    model = load_simulation(rollout).model  # slide, range -.05 to .6
     qpos = np.tile(rollout.qpos0, (4, 1))
     qpos[:, 0] = [0.6, 0.6005, 0.602, -0.07]
     report = joint_limit_violations(model, qpos)
@@ -93,7 +96,7 @@ def test_joint_limits_count_samples_beyond_the_tolerance(rollout):
 
 
 def test_deviation_measures_every_kind_of_joint(rollout):
-    model = load_scene(rollout).model
+    model = load_simulation(rollout).model
     stored = np.tile(rollout.qpos0, (3, 1))
     changed = stored.copy()
     changed[1, 0] += 0.002
@@ -106,11 +109,11 @@ def test_deviation_measures_every_kind_of_joint(rollout):
 
 
 def test_perturbed_poses_stay_within_their_sizes(rollout):
-    scene, settings = load_scene(rollout), Perturbation()
+    sim, sizes = load_simulation(rollout), Perturbation()
     shifts, turns = [], []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        qpos = perturb_state(scene, rollout.qpos0, rng, settings)
+        qpos = perturb_objects(sim, rng, sizes)
         assert qpos[0] == rollout.qpos0[0]  # the hand is left alone
         shifts.append(np.abs(qpos[1:4] - rollout.qpos0[1:4]).max())
         turns.append(2 * np.arccos(np.clip(abs(qpos[4]), 0, 1)))
@@ -120,34 +123,34 @@ def test_perturbed_poses_stay_within_their_sizes(rollout):
 
 
 def test_perturbed_masses_friction_and_controls(rollout):
-    scene = load_scene(rollout)
+    sim = load_simulation(rollout)
     mass, friction, noise = [], [], []
     for index in range(60):
-        changed, _, ctrl = perturb(scene, rollout, seed=0, index=index)
-        body = scene.object_body[0]
-        factor = changed.model.body_mass[body] / scene.model.body_mass[body]
-        inertia = changed.model.body_inertia[body] / scene.model.body_inertia[body]
+        changed = perturb(sim, seed=0, index=index)
+        body = sim.object_body[0]
+        factor = changed.model.body_mass[body] / sim.model.body_mass[body]
+        inertia = changed.model.body_inertia[body] / sim.model.body_inertia[body]
         np.testing.assert_allclose(inertia, factor)
-        assert changed.model.body_mass[1] == scene.model.body_mass[1]
-        ratio = changed.model.geom_friction / scene.model.geom_friction
+        assert changed.model.body_mass[1] == sim.model.body_mass[1]
+        ratio = changed.model.geom_friction / sim.model.geom_friction
         assert np.ptp(ratio) < 1e-12
         mass.append(factor)
         friction.append(ratio[0, 0])
-        noise.append(ctrl - rollout.ctrl)
+        noise.append(changed.ctrl - rollout.ctrl)
     for factors in (mass, friction):
         assert 0.8 <= min(factors) < 0.85
         assert 1.15 < max(factors) <= 1.2
     # the slide may travel .65 m, of which .4 m count
     assert np.std(noise) == pytest.approx(0.005 * 0.4, rel=0.05)
-    assert scene.model.body_mass[scene.object_body[0]] == 0.3
+    assert sim.model.body_mass[sim.object_body[0]] == 0.3
 
 
 def test_solver_weights_follow_the_mass(rollout):
-    scene = load_scene(rollout)
-    changed, _, _ = perturb(scene, rollout, seed=0, index=0)
-    body = scene.object_body[0]
+    sim = load_simulation(rollout)
+    changed = perturb(sim, seed=0, index=0)
+    body = sim.object_body[0]
     product = changed.model.body_mass[body] * changed.model.body_invweight0[body, 0]
-    expected = scene.model.body_mass[body] * scene.model.body_invweight0[body, 0]
+    expected = sim.model.body_mass[body] * sim.model.body_invweight0[body, 0]
     assert product == pytest.approx(expected)
 
 

@@ -14,8 +14,8 @@ from flashdex import keys
 from flashdex.envs.mdp.assist import AssistConfig
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.rollouts.ledger import Ledger
-from flashdex.rollouts.recorder import LOOK_EVERY, AttemptRing
-from flashdex.rollouts.scorer import JudgeHere
+from flashdex.rollouts.recorder import LOOK_EVERY, EpisodeRecorder
+from flashdex.rollouts.scorer import InlineScorer
 from flashdex.training.guard import GradientGuard
 from flashdex.training.logging import MetricLog
 from flashdex.training.session import Start
@@ -45,7 +45,7 @@ def make_trainer(make_bench, tmp_path):
             env,
             bench.make_learner(env),
             ledger,
-            JudgeHere(ledger, bench.attempt_maker(env.physics.scenes)),
+            InlineScorer(ledger, bench.rollout_builder(env.physics.scenes)),
             MetricLog(tmp_path, recipe),
             start=Start(env_steps=0, wall_s=0.0, lost=0),
         )
@@ -59,7 +59,7 @@ def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer):
     algo = {"min_buffer": 20, "updates_per_step": 2.0}
     trainer = make_trainer("warp", algo=algo, assist=AssistConfig(enabled=True))
     td = trainer.env.reset()
-    trainer.attempts.begin()
+    trainer.recorder.record_start()
     with trainer.guard:
         for _ in range(LOOK_EVERY):
             td = trainer.vector_step(td)
@@ -88,17 +88,17 @@ def random_steps(env, steps, *, seed=0):
 
 def test_looking_seldom_finds_the_same_episodes(make_env):
     env = make_env(6, attempt_share=0.5)
-    often, seldom = AttemptRing(env, look_every=1), AttemptRing(env, look_every=7)
+    often, seldom = (EpisodeRecorder(env, look_every=n) for n in (1, 7))
     one, other = [], []
     for number, (action, done) in enumerate(random_steps(env, 200)):
         if action is None:
             continue
-        # the state before the step is the one after the restart: begin comes first
-        one += often.step(action, done, number)
-        other += seldom.step(action, done, number)
-        for ring in (often, seldom):
-            ring.begin()
-    other += seldom.look()
+        # the state before the step is the one after the restart: the start comes first
+        one += often.record_step(action, done, number)
+        other += seldom.record_step(action, done, number)
+        for recorder in (often, seldom):
+            recorder.record_start()
+    other += seldom.finished()
     assert len(one) == len(other) > 6
     for a, b in zip(one, other, strict=True):
         assert (a.env, a.env_steps, a.motion, a.frame) == (

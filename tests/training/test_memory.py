@@ -123,14 +123,14 @@ def test_the_bank_is_exact(trained):
 
 
 def test_the_rings_of_attempts_are_exact(trained):
-    from flashdex.rollouts.recorder import AttemptRing
+    from flashdex.rollouts.recorder import EpisodeRecorder
 
     env, _, plan = trained(attempt_share=0.5)
-    ring = AttemptRing(env)
-    ring.begin()
+    recorder = EpisodeRecorder(env)
+    recorder.record_start()
     action = torch.zeros(6, 2, env.bank.num_joints)
-    ring.step(action, torch.zeros(6, 1, dtype=torch.bool), 0)
-    assert part(plan, "attempts").size == tensor_bytes(ring._rings)
+    recorder.record_step(action, torch.zeros(6, 1, dtype=torch.bool), 0)
+    assert part(plan, "attempts").size == tensor_bytes(recorder._rings)
 
 
 def test_the_window_of_n_steps_is_exact(trained):

@@ -8,10 +8,10 @@ import torch
 
 from flashdex import keys
 from flashdex.metrics.criteria import score
-from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.build import RolloutBuilder
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.recorder import AttemptRing
-from flashdex.rollouts.resimulation import load_scene, resimulate
+from flashdex.rollouts.recorder import EpisodeRecorder
+from flashdex.rollouts.resimulation import load_simulation, resimulate
 from flashdex.rollouts.rollout import Rollout
 
 
@@ -31,18 +31,18 @@ def attempts(roll_tiny):
 
 
 def test_one_full_length_attempt_a_motion(attempts, library):
-    assert [a.rollout.motion for a in attempts] == library.names
-    for attempt, length in zip(
+    assert [rollout.motion for rollout in attempts] == library.names
+    for rollout, length in zip(
         attempts, library.motions["length"].tolist(), strict=True
     ):
-        assert attempt.completed
-        assert attempt.rollout.num_frames == length - 1
-        assert attempt.rollout.reference_length == length - 1
+        assert rollout.completed
+        assert rollout.num_frames == length - 1
+        assert rollout.reference_length == length - 1
 
 
 @pytest.mark.parametrize("motion", [0, 1, 2])
 def test_replay_is_bit_equal(attempts, tmp_path, motion):
-    path = attempts[motion].rollout.save(tmp_path / "rollout.npz")
+    path = attempts[motion].save(tmp_path / "rollout.npz")
     rollout = Rollout.load(path)
     touched = 0
 
@@ -52,7 +52,7 @@ def test_replay_is_bit_equal(attempts, tmp_path, motion):
             1 for c in data.contact if {model.geom_bodyid[g] for g in c.geom} - {0}
         )
 
-    run = resimulate(load_scene(rollout), rollout, monitor=watch)
+    run = resimulate(load_simulation(rollout), monitor=watch)
     assert touched > 200
     assert (run.qpos == rollout.qpos).all()
     deviation = certify(rollout, num_perturbations=0).deviation
@@ -63,11 +63,10 @@ def test_replay_is_bit_equal(attempts, tmp_path, motion):
 
 
 def test_what_is_scored_is_what_the_engine_measures(attempts):
-    for attempt in attempts:
-        rollout = attempt.rollout
-        run = resimulate(load_scene(rollout), rollout)
-        ours = score(rollout.signals(), grace=rollout.grace)
-        theirs = score(run.signals, grace=rollout.grace)
+    for rollout in attempts:
+        run = resimulate(load_simulation(rollout))
+        ours = rollout.score()
+        theirs = score(run.errors, grace=rollout.grace)
         for name, verdict in ours.items():
             assert verdict.state == theirs[name].state
             for key, value in verdict.values.items():
@@ -75,7 +74,7 @@ def test_what_is_scored_is_what_the_engine_measures(attempts):
 
 
 def test_rows_are_scored_on_the_right_frames(attempts, library):
-    rollout = attempts[2].rollout
+    rollout = attempts[2]
     start, length = (int(library.motions[k][2]) for k in ("start", "length"))
     rows = slice(start + 1, start + length)
     ref = library.frames["object_pos"][rows].numpy()
@@ -95,8 +94,8 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
         finger_mode="residual",
         assist=AssistConfig(enabled=True),
     )
-    ring = AttemptRing(env)
-    maker = AttemptMaker(
+    recorder = EpisodeRecorder(env)
+    builder = RolloutBuilder(
         env.bank,
         env.hands,
         env.physics.scenes,
@@ -107,7 +106,7 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
     )
     env.forced_motion = torch.tensor([2, 1, 0, 2, 1, 0])
     td, act, found = env.reset(), shaky(0.3), []
-    ring.begin()
+    recorder.record_start()
     for step in range(110):
         if step % 20 == 0:
             env.forced_motion = (env.forced_motion + 1) % 3
@@ -116,15 +115,14 @@ def test_training_attempts_replay_bit_equal_after_resets(make_env):
             td.set(keys.action(side), action[:, i])
         td = env.step(td)
         done = td["next", keys.DONE]
-        found += [maker.make(e) for e in ring.step(action, done, step)]
+        found += recorder.record_step(action, done, step)
         td = env.maybe_reset(td["next"].clone())
-        ring.begin()
-    assert len(found) > 5
-    motions = {a.rollout.motion for a in found}
-    assert "both" in motions
-    for attempt in found[-6:]:
-        rollout = attempt.rollout
-        run = resimulate(load_scene(rollout), rollout)
+        recorder.record_start()
+    rollouts = [builder.build(episode) for episode in found]
+    assert len(rollouts) > 5
+    assert "both" in {rollout.motion for rollout in rollouts}
+    for episode, rollout in zip(found[-6:], rollouts[-6:], strict=True):
+        run = resimulate(load_simulation(rollout))
         assert (run.qpos == rollout.qpos).all()
-        assert attempt.completed == (not attempt.why)
-        assert attempt.frame == rollout.num_frames
+        assert rollout.completed == (not rollout.terminations)
+        assert episode.frame == rollout.num_frames

@@ -1,4 +1,4 @@
-"""Signals against closed forms."""
+"""Tracking errors against closed forms."""
 
 import math
 
@@ -11,7 +11,7 @@ from flashdex.metrics.criteria import score
 from flashdex.metrics.errors import (
     align_to_reference,
     centred_position_error,
-    compute_signals,
+    compute_tracking_errors,
     joint_position_error,
     reference_drift,
 )
@@ -27,7 +27,7 @@ def one_object(pos, quat, ref_pos, ref_quat, **kwargs):
         "ref_object_quat": ref_quat,
     }
     masks = {"hand_active": (False, True), "hand_object": (-1, 0)}
-    return compute_signals(data, **(masks | kwargs))
+    return compute_tracking_errors(data, **(masks | kwargs))
 
 
 def rotation_error(angle, dtype=torch.float64):

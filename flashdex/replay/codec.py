@@ -8,7 +8,7 @@ with two objects take under 1 kB a row.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,9 +16,6 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-
-if TYPE_CHECKING:
-    pass
 
 _MAX_SPEED = 1000.0  # m/s or rad/s; beyond it the episode has ended as insane anyway
 

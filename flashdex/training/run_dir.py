@@ -33,8 +33,7 @@ from flashdex.training.checkpoint import (
     remove_temporaries,
     set_aside_newer,
 )
-from flashdex.training.memory import check_memory
-from flashdex.training.memory_library import find_library
+from flashdex.training.memory import check_memory, find_library
 from flashdex.training.session import end_session, refuse_changes
 
 _LOG = logging.getLogger(__name__)

@@ -60,10 +60,10 @@ def _verdict(plan: MemoryPlan) -> list[str]:
             f"memory holds: flashdex doctor {plan.recipe.name} algo.device=cpu"
         ]
     if not plan.fits:
-        first = f"It does not fit: {used(plan, plan.short)}. Any of these fits:"
+        first = f"It does not fit: {used(plan, *plan.short)}. Any of these fits:"
         return [first, *(f"  {words}" for words in overrides_that_fit(plan))]
     if plan.tight:
-        return [f"It fits, but is tight: {used(plan, plan.tight)}."]
+        return [f"It fits, but is tight: {used(plan, *plan.tight)}."]
     return ["It fits."]
 
 

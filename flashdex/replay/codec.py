@@ -199,9 +199,6 @@ def finite_rows(row: TensorDictBase) -> Tensor:
     Reward, action and state are finite, and so is the state at the window's end unless
     the window ends in a true termination: nothing is bootstrapped from that one, and
     packing replaces what is not finite in it.
-
-    Args:
-        row: state, action, reward, next_state and terminated, batch (N,).
     """
     own = {k: row.get(k) for k in ("state", "action", "reward")}
     after = _all_finite(row.get("next_state")) | row.get("terminated").squeeze(-1)

@@ -79,11 +79,7 @@ class ReplayLog:
         return int(self.buffer.storage.max_size)
 
     def save(self, stem: str) -> None:
-        """Write what is new, then the manifest ``<stem>.json``.
-
-        Args:
-            stem: name of the checkpoint it belongs to.
-        """
+        """Write what is new, then the manifest ``<stem>.json``."""
         if not self.enabled:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -132,9 +128,6 @@ class ReplayLog:
 
         Equal capacity puts every row where it was, so that sampling goes on bit-equal;
         a smaller or larger ring takes the newest rows.
-
-        Args:
-            stem: name of the checkpoint.
 
         Returns:
             Whether the rows are there; a warning says why not, unless none were stored.
@@ -185,11 +178,7 @@ class ReplayLog:
         self._written = written if same else len(self.buffer)
 
     def prune(self, stems: set[str]) -> None:
-        """Delete what no remaining checkpoint needs.
-
-        Args:
-            stems: names of the remaining checkpoints.
-        """
+        """Delete what no remaining checkpoint needs."""
         needed = {f"{stem}.json" for stem in stems}
         for stem in stems:
             path = self.folder / f"{stem}.json"

@@ -22,9 +22,6 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
     A reader, or a run that continues after a crash, finds the old file or the whole new
     one. What was written is on the disk when the block ends.
 
-    Args:
-        path: the file; its directory is made, an older file is replaced.
-
     Example:
         >>> with open_atomic(Path("notes.bin")) as file:  # doctest: +SKIP
         ...     file.write(b"all of it")
@@ -43,12 +40,7 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file, UTF-8, as ``open_atomic`` does.
-
-    Args:
-        path: the file.
-        text: its content.
-    """
+    """Write a text file, UTF-8, as ``open_atomic`` does."""
     with open_atomic(path) as file:
         file.write(text.encode("utf-8"))
 
@@ -92,9 +84,6 @@ def run_lock(run_dir: Path) -> Iterator[None]:
     """Hold a run directory; a second training process there is refused.
 
     File systems without locks are used without one.
-
-    Args:
-        run_dir: existing run directory.
 
     Raises:
         RunError: another process trains in it.

@@ -41,11 +41,7 @@ class Machine:
 
 
 def look_at_machine(run_dir: Path) -> Machine:
-    """Ask the device, the kernel and the file system.
-
-    Args:
-        run_dir: run directory; it need not exist.
-    """
+    """Ask the device, the kernel and the file system."""
     gpu, name = None, ""
     if torch.cuda.is_available():
         gpu, _ = torch.cuda.mem_get_info()
@@ -169,7 +165,7 @@ def describe_commit() -> str:
 
 
 def _output(*words: str) -> str | None:
-    """What a program prints, run beside this file; None without it or where it fails."""
+    """What a program prints, run beside this file; None where it fails."""
     options: Any = {"capture_output": True, "text": True, "timeout": 20}
     try:
         done = subprocess.run(words, cwd=Path(__file__).parent, check=True, **options)
@@ -192,12 +188,7 @@ ENGINE_PACKAGES = {
 
 
 def versions(engine: str = "cpu", device: torch.device | None = None) -> dict[str, Any]:
-    """Package versions, engine and hardware that produce a rollout.
-
-    Args:
-        engine: physics engine of the recipe.
-        device: where it ran; the cpu when None.
-    """
+    """Package versions, engine and hardware that produce a rollout."""
     own = ("flashdex", "torch", "torchrl", "tensordict")
     found = {name: _version(name) or "source" for name in own}
     found |= {name: version(name) for name in ENGINE_PACKAGES.get(engine, ())}

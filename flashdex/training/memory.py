@@ -16,16 +16,15 @@ from pathlib import Path
 
 import mujoco
 import torch
-from tensordict import TensorDict
 
 from flashdex.errors import FlashdexError
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
 from flashdex.rollouts.recorder import LOOK_EVERY
 from flashdex.system.machine import Machine, Pool, look_at_machine
-from flashdex.training.build import learner_device, library_name, select_motions
+from flashdex.training.build import learner_device
 from flashdex.training.rehearsal import Rehearsal
-from flashdex.training.stand_in import Collection
+from flashdex.training.stand_in import Collection, find_library
 
 _LOG = logging.getLogger(__name__)
 TIGHT = 0.9  # share of what is free
@@ -77,9 +76,7 @@ def list_parts(recipe: Recipe, sizes: Rehearsal, *, device: Pool) -> list[Part]:
     ]
     if device == "gpu":
         about = "for storing rollouts"
-        parts.append(
-            Part("references on the host", "host", frames + objects, about),
-        )
+        parts.append(Part("references on the host", "host", frames + objects, about))
         parts.append(Part("CUDA", "gpu", GPU_ALLOWANCE, allowance))
     parts.append(Part("libraries", "host", HOST_ALLOWANCE, allowance))
     return [
@@ -278,26 +275,6 @@ def plan_memory(
     return MemoryPlan(recipe, device, parts, machine, sizes)
 
 
-def find_library(recipe: Recipe) -> MotionLibrary | None:
-    """The prepared library of a recipe with the motions it selects, or None.
-
-    Its frames are left out: only their number counts here.
-
-    Args:
-        recipe: validated recipe.
-
-    Raises:
-        LibraryError: it is broken, or nothing in it is selected.
-    """
-    folder = recipe.motions.library
-    path = Path(folder) if folder else Path("libraries") / library_name(recipe)
-    if not (path / "manifest.json").is_file():
-        return None
-    library = MotionLibrary.load(path)
-    empty = TensorDict({}, batch_size=library.frames.batch_size)
-    return select_motions(dataclasses.replace(library, frames=empty), recipe)
-
-
 def overrides_that_fit(plan: MemoryPlan) -> list[str]:
     """Changes that make a plan fit, each a line of ``key=value`` words by itself."""
     recipe, found = plan.recipe, []
@@ -349,7 +326,7 @@ def format_size(size: int) -> str:
     return f"{value:,.0f} GB" if value >= 99.5 else f"{value:.3g} GB"
 
 
-def used(plan: MemoryPlan, pools: list[Pool]) -> str:
+def used(plan: MemoryPlan, *pools: Pool) -> str:
     """Need of each pool, and what it has."""
     return "; ".join(
         f"{NAMES[p]} {format_size(plan.need(p))} of "
@@ -372,7 +349,7 @@ def assumption(plan: MemoryPlan) -> str:
 def _refusal(plan: MemoryPlan) -> str:
     lines = [
         f"{plan.recipe.name}: this machine has too little memory: "
-        f"{used(plan, plan.short)}."
+        f"{used(plan, *plan.short)}."
     ]
     largest = sorted(plan.parts, key=lambda p: p.size, reverse=True)
     for pool in plan.short:
@@ -395,11 +372,6 @@ def check_memory(
 ) -> str:
     """Refuse a run that cannot fit, before anything is allocated.
 
-    Args:
-        recipe: validated recipe.
-        library: its motions; see `plan_memory`.
-        run_dir: where checkpoints go.
-
     Returns:
         One line about what the run will need. Where it is tight a warning is logged.
 
@@ -411,6 +383,6 @@ def check_memory(
         raise FlashdexError(_refusal(plan))
     if plan.tight:
         note = f" ({assumption(plan)})" if assumption(plan) else ""
-        _LOG.warning("memory is tight: %s%s", used(plan, plan.tight), note)
-    known = [p for p in POOLS if plan.need(p) and plan.machine.free(p) is not None]
-    return f"memory: {', '.join(used(plan, [p]) for p in known)}"
+        _LOG.warning("memory is tight: %s%s", used(plan, *plan.tight), note)
+    known = (p for p in POOLS if plan.need(p) and plan.machine.free(p) is not None)
+    return f"memory: {', '.join(used(plan, pool) for pool in known)}"

@@ -167,13 +167,7 @@ def flashsac_update(
 def ask_algorithm(
     recipe: Recipe, learner: Learner, state: TensorDictBase
 ) -> tuple[Networks, int, Update]:
-    """Networks of the recipe, bytes of an observation, and the update.
-
-    Args:
-        recipe: networks at their full width.
-        learner: of `Rehearsal`, narrow where that is costly.
-        state: what it has remembered, (N,).
-    """
+    """Networks of the recipe, bytes of an observation, and the update."""
     ask = {"flashsac": _ask_flashsac, "ppo": _ask_ppo}
     return ask[recipe.algo.kind](recipe.algo, learner, state)
 
@@ -254,15 +248,14 @@ class Rehearsal:
         self._batch = cast(CpuPhysics, env.physics).batch
         self.model = env.physics.scenes[0].model
         learner, self._ring = bench.make_learner(env), AttemptRing(env)
-        td = env.reset()
+        td: Any = env.rand_step(env.reset())
         self._ring.begin()
-        td = env.rand_step(td)
         after, action = td["next"], torch.zeros(_WORLDS, 2, joints)
         self._ring.step(action, after[keys.DONE], 0)
         flags, reward = (after[keys.TERMINATED], after[keys.DONE]), torch.zeros(2, 2)
         with _quiet(logging.getLogger("torchrl")):  # it tells of its buffer
             for _ in range(recipe.algo.n_step):
-                learner.remember(td, action, reward, after, *flags)
+                learner.remember(td, action, reward, after, flags[0], flags[1])
         ends = [list(end.select(*keys.STATE).values(True, True)) for end in (td, after)]
         self.step_bytes = tensor_bytes([ends, action, reward, flags]) // _WORLDS
         """One step of one world before packing: states, action, reward, flags."""

@@ -6,6 +6,7 @@ is not prepared yet has none.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from flashdex.envs.scene.scene import SceneLayout
 from flashdex.motions.library import FRAME_KEYS, NUM_OBJECT_SLOTS, MotionLibrary
 from flashdex.objects.asset import ObjectSettings
 from flashdex.recipe import Recipe
+from flashdex.training.build import library_name, select_motions
 
 # Assumed of motions that are not prepared yet: motions, seconds, support discs.
 MOTIONS, SECONDS, SUPPORTS = 100, 20.0, 4
@@ -81,6 +83,23 @@ class Collection:
             slots=slots,
             fps=recipe.motions.control_hz,
         )
+
+
+def find_library(recipe: Recipe) -> MotionLibrary | None:
+    """The prepared library of a recipe with the motions it selects, or None.
+
+    Its frames are left out: only their number counts here.
+
+    Raises:
+        LibraryError: it is broken, or nothing in it is selected.
+    """
+    folder = recipe.motions.library
+    path = Path(folder) if folder else Path("libraries") / library_name(recipe)
+    if not (path / "manifest.json").is_file():
+        return None
+    library = MotionLibrary.load(path)
+    empty = TensorDict({}, batch_size=library.frames.batch_size)
+    return select_motions(dataclasses.replace(library, frames=empty), recipe)
 
 
 class StandIn(MotionLibrary):

@@ -78,10 +78,10 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     Raises:
         FlashdexError: the recipe has mistakes or trains no motions.
     """
+    from flashdex.cli.memory_report import format_cards, format_plan, format_work
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.build import learner_device
     from flashdex.training.memory import plan_memory
-    from flashdex.training.memory_text import format_cards, format_plan, format_work
     from flashdex.training.run_dir import default_run_dir
 
     recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")
@@ -93,7 +93,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
         recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
     )
     parts = [format_plan(plan)]
-    if recipe.algo.kind == "flashsac":
+    if plan.sizes.row_bytes:
         parts += [format_cards(plan)] * on_gpu + [format_work(plan)]
     return "\n\n".join(parts), plan.fits and not (on_gpu and plan.machine.gpu is None)
 

@@ -90,7 +90,7 @@ class TrackingErrors:
     fps: float  # control rate, Hz
     missing: Mapping[str, str] = field(
         default_factory=dict
-    )  # absent error -> key that was missing
+    )  # error -> absent key
     overflow: bool = False  # the engine dropped contacts or constraints
 
     @property
@@ -223,7 +223,7 @@ def frozen_object(
     """Errors of objects that stay at their first reference pose: pure arithmetic.
 
     Criteria with hand terms are not measured on it: there is no hand. Positions are
-    world, m, (T, O, 3), quaternions wxyz, (T, O, 4); the rest as in `compute_tracking_errors`.
+    world, m, (T, O, 3), quaternions wxyz, (T, O, 4). See `compute_tracking_errors`.
     """
     data = {
         "object_pos": ref_pos[:1].expand_as(ref_pos),

@@ -109,24 +109,18 @@ class RowBuffer(ReplayBuffer):
         Raises:
             FlashdexError: the ring does not fit into memory.
         """
-        self._write(rows)
-
-    def _write(self, rows: TensorDict) -> None:
         try:
             self.extend(rows)
         except RuntimeError as error:
             if self.ring.initialized:
                 raise
-            raise self._too_large(rows) from error
-
-    def _too_large(self, rows: TensorDict) -> FlashdexError:
-        width = row_bytes(rows)
-        return FlashdexError(
-            f"algo.buffer_size: {self.capacity} rows of {width} bytes are "
-            f"{self.capacity * width / 1e9:.1f} GB, which {self.ring.device} cannot "
-            "hold. Choose fewer rows, or on a CUDA device algo.replay=pinned, which "
-            "keeps them in host memory."
-        )
+            width = row_bytes(rows)
+            raise FlashdexError(
+                f"algo.buffer_size: {self.capacity} rows of {width} bytes are "
+                f"{self.capacity * width / 1e9:.1f} GB, which {self.ring.device} "
+                "cannot hold. Choose fewer rows, or on a CUDA device "
+                "algo.replay=pinned, which keeps them in host memory."
+            ) from error
 
     def draw(self, count: int = 1) -> TensorDictBase:
         """Rows of ``count`` batches on the learner's device, (count B,)."""
@@ -146,37 +140,25 @@ class HostBuffer(RowBuffer):
 
     Args:
         capacity: rows of the ring.
-        batch_size: rows B of one batch.
-        device: of the learner.
-        generator: draws the samples, on the host; with ``prefetch`` nobody else may
-            draw from it.
-        prefetch: batches that threads gather ahead; 0 gathers when asked.
         stages: pushes that rows may be on their way.
         pinned: exchange rows through page-locked memory, which a CUDA device copies
             from and to while host and device go on.
+        options: of `RowBuffer`. The generator is on the host; with ``prefetch`` nobody
+            else may draw from it.
     """
 
     def __init__(
         self,
         capacity: int,
         *,
-        batch_size: int,
-        device: torch.device,
-        generator: torch.Generator,
-        prefetch: int = 0,
         stages: int = STAGES,
         pinned: bool = False,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            capacity,
-            batch_size=batch_size,
-            device=device,
-            generator=generator,
-            kept_on=torch.device("cpu"),
-            prefetch=prefetch,
-            pinned=pinned,
-        )
-        self.prefetch, self.stages, self.pinned = prefetch, stages, pinned
+        host = torch.device("cpu")
+        super().__init__(capacity, kept_on=host, pinned=pinned, **options)
+        self.prefetch = options.get("prefetch", 0)
+        self.stages, self.pinned = stages, pinned
         self._coming: deque[tuple[TensorDict, torch.cuda.Event | None]] = deque()
 
     def push(self, rows: TensorDict) -> None:
@@ -205,14 +187,14 @@ class HostBuffer(RowBuffer):
         rows, event = self._coming.popleft()
         if event is not None:
             event.synchronize()
-        self._write(rows)
+        super().push(rows)
 
     def draw(self, count: int = 1) -> TensorDictBase:
         """Rows of ``count`` batches on the learner's device, (count B,)."""
         if not self.prefetch:
-            return self._to_learner(self.sample(count * self.rows_per_batch))
-        batches = [self._to_learner(self.sample()) for _ in range(count)]
-        return batches[0] if count == 1 else torch.cat(batches)  # pyright: ignore[reportReturnType,reportArgumentType,reportCallIssue]
+            return self._to_learner(super().draw(count))
+        batches: Any = [self._to_learner(self.sample()) for _ in range(count)]
+        return batches[0] if count == 1 else cast(Any, torch.cat(batches))
 
     def _to_learner(self, rows: TensorDictBase) -> TensorDictBase:
         if self.learner_device.type == "cpu":

@@ -8,7 +8,7 @@ with two objects take under 1 kB a row.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,9 +16,6 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.reference import ReferenceBank
-
-if TYPE_CHECKING:
-    pass
 
 _MAX_SPEED = 1000.0  # m/s or rad/s; beyond it the episode has ended as insane anyway
 
@@ -202,9 +199,6 @@ def finite_rows(row: TensorDictBase) -> Tensor:
     Reward, action and state are finite, and so is the state at the window's end unless
     the window ends in a true termination: nothing is bootstrapped from that one, and
     packing replaces what is not finite in it.
-
-    Args:
-        row: state, action, reward, next_state and terminated, batch (N,).
     """
     own = {k: row.get(k) for k in ("state", "action", "reward")}
     after = _all_finite(row.get("next_state")) | row.get("terminated").squeeze(-1)

@@ -13,33 +13,25 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
 from flashdex.replay.buffer import RowBuffer
+from flashdex.replay.codec import row_bytes
 from flashdex.system.files import open_atomic, write_atomic
 
-if TYPE_CHECKING:
-    from flashdex.replay.disk import ReplayLog
-
 _LOG = logging.getLogger(__name__)
-REPLAY = "replay"
+FOLDER, REPLAY = "checkpoints", "replay"  # of the run, and in it
 PART_BYTES = 1 << 28  # of one segment; bounds the memory a checkpoint takes
 _WRAP = 1 << 32  # torchrl counts written rows in 32 bits
 
 
 @dataclass(frozen=True)
 class Segment:
-    """One file of rows.
-
-    Attributes:
-        file: name in the folder.
-        first: number of its first row.
-        rows: how many follow.
-    """
+    """One file of rows: its name, the number of its first row, how many rows."""
 
     file: str
     first: int
@@ -55,6 +47,10 @@ def replay_of(learner: object) -> ReplayBuffer | None:
     """The replay buffer of a learner, None when it keeps none."""
     buffer = getattr(learner, "buffer", None)
     return buffer if isinstance(buffer, ReplayBuffer) else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 class ReplayLog:
@@ -83,11 +79,7 @@ class ReplayLog:
         return int(self.buffer.storage.max_size)
 
     def save(self, stem: str) -> None:
-        """Write what is new, then the manifest ``<stem>.json``.
-
-        Args:
-            stem: name of the checkpoint it belongs to.
-        """
+        """Write what is new, then the manifest ``<stem>.json``."""
         if not self.enabled:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -119,9 +111,7 @@ class ReplayLog:
             return []
         cursor = self.buffer.writer.state_dict()["_cursor"]
         storage: Any = self.buffer.storage
-        row = storage[0]
-        width = sum(v.numel() * v.element_size() for v in row.values(True, True))
-        size = max(1, PART_BYTES // max(width, 1))
+        size = max(1, PART_BYTES // max(row_bytes(storage[:1]), 1))
         out = []
         for first in range(start, self._written, size):
             end = min(first + size, self._written)
@@ -139,9 +129,6 @@ class ReplayLog:
         Equal capacity puts every row where it was, so that sampling goes on bit-equal;
         a smaller or larger ring takes the newest rows.
 
-        Args:
-            stem: name of the checkpoint.
-
         Returns:
             Whether the rows are there; a warning says why not, unless none were stored.
         """
@@ -149,8 +136,7 @@ class ReplayLog:
         if not path.is_file():
             return False
         try:
-            text = path.read_text(encoding="utf-8")
-            manifest = json.loads(text)
+            manifest = _read(path)
             if manifest["meaning"] != self.meaning:
                 _LOG.warning("an override changed what replay rows mean: none is kept")
                 return False
@@ -192,22 +178,15 @@ class ReplayLog:
         self._written = written if same else len(self.buffer)
 
     def prune(self, stems: set[str]) -> None:
-        """Delete what no remaining checkpoint needs.
-
-        Args:
-            stems: names of the remaining checkpoints.
-        """
+        """Delete what no remaining checkpoint needs."""
         needed = {f"{stem}.json" for stem in stems}
         for stem in stems:
             path = self.folder / f"{stem}.json"
             if path.is_file():
-                manifest = json.loads(path.read_text(encoding="utf-8"))
+                manifest = _read(path)
                 needed |= {s["file"] for s in manifest["segments"]}
         for path in self.folder.glob("*"):
             if path.name not in needed:
                 path.unlink()
         # after a failed save its segments are gone, and have to be written again
         self._segments = [s for s in self._segments if s.file in needed]
-
-
-FOLDER = "checkpoints"

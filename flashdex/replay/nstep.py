@@ -50,8 +50,7 @@ class NStepAssembler:
             done: failure or truncation, (N, 1) bool.
 
         Returns:
-            TensorDict (N,) with state, action, reward, next_state, terminated and
-            steps, or None while the first window fills.
+            (N,) of the arguments without ``done``, with ``steps``; or None.
         """
         step = {
             "state": state,
@@ -71,13 +70,14 @@ class NStepAssembler:
         reward = first["reward"].clone()
         alive = ~first["done"]
         steps = torch.ones_like(first["done"], dtype=torch.int64)
-        last = first
+        last: Any = first.select("next_state", "terminated")
         for j in range(1, self.n_step):
             step = self._steps[j]
             reward = reward + self.gamma**j * step["reward"] * alive
             steps = steps + alive.long()
             # Worlds still running move the window's end to this step.
-            last = _select(alive, step, last)
+            end: Any = step.select("next_state", "terminated")
+            last = torch.where(alive.squeeze(-1), end, last)
             alive = alive & ~step["done"]
         row = {
             "state": first["state"],
@@ -101,22 +101,5 @@ class NStepAssembler:
         """Restore ``state_dict``."""
         self._steps.clear()
         for step in state["steps"]:
-            size = step["done"].shape[:1]
-            loaded = TensorDict(step, batch_size=size)
-            self._steps.append(
-                loaded if self.device is None else loaded.to(self.device)
-            )
-
-
-def _select(mask: Tensor, new: TensorDict, old: TensorDict) -> TensorDict:
-    """Rows of ``new`` where ``mask`` (N, 1), else of ``old``."""
-    keep = mask.squeeze(-1)
-    out = {}
-    for key in ("next_state", "terminated"):
-        a, b = new[key], old[key]
-        out[key] = (
-            torch.where(keep, a, b)
-            if isinstance(a, TensorDictBase)
-            else (torch.where(mask, a, b))
-        )
-    return TensorDict(out, batch_size=keep.shape)
+            loaded = TensorDict(step, step["done"].shape[:1], device=self.device)
+            self._steps.append(loaded)

@@ -16,12 +16,7 @@ def keep_freed_memory(*, megabytes: int = 1024) -> bool:
     By default blocks above some size are mapped anew each time and the top of the heap
     is returned; an update of the learner then takes thousands of page faults, 10 to
     15 % of its time. The setting holds for the whole process; peak memory is unchanged.
-
-    Args:
-        megabytes: freed memory that is kept at most.
-
-    Returns:
-        Whether the allocator took it; False outside of Linux with glibc.
+    False where the allocator does not take it, as outside of Linux with glibc.
     """
     if not sys.platform.startswith("linux"):
         return False

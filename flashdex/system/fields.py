@@ -13,28 +13,15 @@ def number(
     high: float | None = None,
     above: float | None = None,
 ) -> Any:
-    """Return a dataclass field with a default and an allowed range.
-
-    Args:
-        default: the value used when the recipe says nothing.
-        low: smallest allowed value, itself allowed.
-        high: largest allowed value, itself allowed.
-        above: bound that the value must exceed, itself refused.
-    """
+    """A dataclass field that is at least ``low``, at most ``high``, above ``above``."""
     return dataclasses.field(
         default=default, metadata={"low": low, "high": high, "above": above}
     )
 
 
 def range_problem(field: dataclasses.Field[Any], value: float) -> str | None:
-    """Say in words how a value breaks the range of its field, or return None.
-
-    Args:
-        field: the dataclass field, made by `number` or plain (no range).
-        value: the number the recipe gives.
-    """
-    low, high = field.metadata.get("low"), field.metadata.get("high")
-    above = field.metadata.get("above")
+    """How a value breaks the range of its field, in words; None where it does not."""
+    low, high, above = (field.metadata.get(k) for k in ("low", "high", "above"))
     if above is not None and not value > above:
         return f"{value} must be greater than {above}"
     if low is not None and not value >= low:

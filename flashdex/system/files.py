@@ -5,17 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-from flashdex.errors import RunError
+from filelock import FileLock, Timeout
 
-try:
-    import fcntl
-except ImportError:  # not a POSIX system
-    fcntl = None
+from flashdex.errors import RunError
 
 
 @contextmanager
@@ -24,9 +21,6 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 
     A reader, or a run that continues after a crash, finds the old file or the whole new
     one. What was written is on the disk when the block ends.
-
-    Args:
-        path: the file; its directory is made, an older file is replaced.
 
     Example:
         >>> with open_atomic(Path("notes.bin")) as file:  # doctest: +SKIP
@@ -46,12 +40,7 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file, UTF-8, as ``open_atomic`` does.
-
-    Args:
-        path: the file.
-        text: its content.
-    """
+    """Write a text file, UTF-8, as ``open_atomic`` does."""
     with open_atomic(path) as file:
         file.write(text.encode("utf-8"))
 
@@ -66,16 +55,11 @@ def waiting_lock(path: Path) -> Iterator[None]:
     Args:
         path: what is being made; its directory is made.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.with_name(f".{path.name}.lock").open("w")
-    except OSError:
-        yield
-        return
-    with file:
-        if fcntl is not None:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
+    with ExitStack() as held:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = path.with_name(f".{path.name}.lock")
+            held.enter_context(FileLock(lock, fallback_to_soft=False))
         yield
 
 
@@ -101,19 +85,15 @@ def run_lock(run_dir: Path) -> Iterator[None]:
 
     File systems without locks are used without one.
 
-    Args:
-        run_dir: existing run directory.
-
     Raises:
         RunError: another process trains in it.
     """
-    if fcntl is None:
-        yield
-        return
-    with (run_dir / LOCK).open("w") as file:
+    (run_dir / LOCK).touch()  # a folder that cannot be written is an error
+    with ExitStack() as held:
+        lock = FileLock(run_dir / LOCK, blocking=False, fallback_to_soft=False)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+            held.enter_context(lock)
+        except Timeout as error:
             raise RunError(
                 f"{run_dir}: another process is training in this folder. Wait for it, "
                 "stop it, or choose another folder with run_dir=..."

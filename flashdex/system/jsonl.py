@@ -27,12 +27,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def append_line(path: Path, line: dict[str, Any]) -> None:
-    """Append one line; it is on the disk when this returns.
-
-    Args:
-        path: JSONL file; made when absent.
-        line: the record.
-    """
+    """Append one line; it is on the disk when this returns."""
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
         file.flush()
@@ -40,11 +35,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
 
 
 def drop_cut_line(path: Path) -> None:
-    """Remove a last line that a crash cut off, or the next one would join it.
-
-    Args:
-        path: JSONL file; need not exist.
-    """
+    """Remove a last line that a crash cut off, or the next one would join it."""
     if not path.is_file():
         return
     content = path.read_bytes()
@@ -55,12 +46,7 @@ def drop_cut_line(path: Path) -> None:
 
 
 def keep_lines(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> None:
-    """Keep the lines that are wanted, in their order; the file changes in one piece.
-
-    Args:
-        path: JSONL file; need not exist.
-        wanted: says which lines stay.
-    """
+    """Keep the lines that are wanted, in their order; the file changes in one piece."""
     if not path.is_file():
         return
     drop_cut_line(path)

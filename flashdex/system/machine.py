@@ -6,9 +6,9 @@ import os
 import platform
 import shutil
 import subprocess
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib import metadata
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,15 +37,11 @@ class Machine:
 
     def free(self, pool: Pool) -> int | None:
         """Free bytes of one pool."""
-        return {"gpu": self.gpu, "host": self.host, "disk": self.disk}[pool]
+        return getattr(self, pool)
 
 
 def look_at_machine(run_dir: Path) -> Machine:
-    """Ask the device, the kernel and the file system.
-
-    Args:
-        run_dir: run directory; it need not exist.
-    """
+    """Ask the device, the kernel and the file system."""
     gpu, name = None, ""
     if torch.cuda.is_available():
         gpu, _ = torch.cuda.mem_get_info()
@@ -76,25 +72,21 @@ def free_host(meminfo: Path = _MEMINFO, cgroup: Path | None = None) -> int | Non
 
 
 def _available(meminfo: Path) -> int | None:
-    try:
-        lines = meminfo.read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
+    with suppress(OSError):
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return None
 
 
 def _own_cgroup() -> Path:
-    try:
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return _CGROUP
-    own = next((line[3:] for line in lines if line.startswith("0::")), "/")
-    folder = _CGROUP / own.lstrip("/")
+    folder = _CGROUP
+    with suppress(OSError):
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
+            if line.startswith("0::"):
+                folder = _CGROUP / line[3:].lstrip("/")
     # inside a container the path may be the host's, which is not mounted here
     return folder if folder.is_dir() else _CGROUP
 
@@ -123,19 +115,15 @@ def _free_disk(folder: Path) -> int | None:
     return shutil.disk_usage(there).free + had
 
 
-PACKAGES = {"warp": "warp-lang", "mujoco_warp": "mujoco-warp", "jax": "jax"}
-
-
 def describe_hardware() -> str:
     """Processor and number of cores."""
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        lines = info.read_text(encoding="utf-8").splitlines()
-        models = [
-            x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")
-        ]
-        name = models[0] if models else name
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                name = line.split(":", 1)[1].strip()
+                break
     return f"{name}, {torch.multiprocessing.cpu_count()} cores"
 
 
@@ -145,6 +133,7 @@ def describe_machine() -> dict[str, Any]:
     ``load_1m`` is the number of busy processes at that moment: above the benchmark's
     own threads, absolute figures are too low and only ratios mean something.
     """
+    packages = {"mujoco": "mujoco", "warp": "warp-lang", "mujoco_warp": "mujoco-warp"}
     found: dict[str, Any] = {
         "processor": describe_hardware(),
         "gpu": None,
@@ -152,15 +141,15 @@ def describe_machine() -> dict[str, Any]:
         "cuda": torch.version.cuda,
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "mujoco": _version("mujoco"),
-        **{name: _version(package) for name, package in PACKAGES.items()},
+        **{name: _version(p) for name, p in {**packages, "jax": "jax"}.items()},
         "load_1m": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
     }
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(torch.cuda.current_device())
         found["gpu"] = properties.name
         found["gpu_memory_gb"] = round(properties.total_memory / 1e9, 1)
-        found["driver"] = _driver()
+        words = ("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+        found["driver"] = next(iter((_output(*words) or "").split()), None)
     return found
 
 
@@ -169,40 +158,27 @@ def describe_commit() -> str:
 
     Outside of git it is what ``FLASHDEX_COMMIT`` says, else empty.
     """
-    folder = Path(__file__).parent
-
-    def git(*words: str) -> str:
-        try:
-            done = subprocess.run(
-                ["git", *words], cwd=folder, capture_output=True, text=True, check=False
-            )
-        except OSError:  # a machine without git
-            return ""
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    commit = git("rev-parse", "--short", "HEAD")
+    commit = _output("git", "rev-parse", "--short", "HEAD")
     if not commit:
         return os.environ.get("FLASHDEX_COMMIT", "")
-    return commit + ("+" if git("status", "--porcelain", "-uno") else "")
+    return commit + ("+" if _output("git", "status", "--porcelain", "-uno") else "")
+
+
+def _output(*words: str) -> str | None:
+    """What a program prints, run beside this file; None where it fails."""
+    options: Any = {"capture_output": True, "text": True, "timeout": 20}
+    try:
+        done = subprocess.run(words, cwd=Path(__file__).parent, check=True, **options)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 def _version(package: str) -> str | None:
     try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
+        return version(package)
+    except PackageNotFoundError:
         return None
-
-
-def _driver() -> str | None:
-    words = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(
-            words, capture_output=True, text=True, check=False, timeout=20
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    lines = done.stdout.split()
-    return lines[0] if done.returncode == 0 and lines else None
 
 
 ENGINE_PACKAGES = {
@@ -212,21 +188,10 @@ ENGINE_PACKAGES = {
 
 
 def versions(engine: str = "cpu", device: torch.device | None = None) -> dict[str, Any]:
-    """Package versions, engine and hardware that produce a rollout.
-
-    Args:
-        engine: physics engine of the recipe.
-        device: where it ran; the cpu when None.
-    """
-    names = ("flashdex", "torch", "torchrl", "tensordict")
-    found: dict[str, Any] = {}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except ModuleNotFoundError:
-            found[name] = "source"
-    for name in ENGINE_PACKAGES.get(engine, ()):
-        found[name] = version(name)
+    """Package versions, engine and hardware that produce a rollout."""
+    own = ("flashdex", "torch", "torchrl", "tensordict")
+    found = {name: _version(name) or "source" for name in own}
+    found |= {name: version(name) for name in ENGINE_PACKAGES.get(engine, ())}
     hardware = f"{platform.machine()}, {os.cpu_count()} CPU cores"
     if device is not None and device.type == "cuda":
         hardware = f"{torch.cuda.get_device_name(device)}, {hardware}"

@@ -1,28 +1,168 @@
 """What memory a recipe needs, whether this machine has it, and what would fit instead.
 
-All of it is computed before anything large is allocated: rows, networks and scenes are
-built tiny or without memory, and multiplied.
+All of it is known before anything large is allocated: what `Rehearsal` finds of a row,
+a world and a frame is multiplied.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import logging
+import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import mujoco
+import torch
+
 from flashdex.errors import FlashdexError
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
+from flashdex.rollouts.recorder import LOOK_EVERY
 from flashdex.system.machine import Machine, Pool, look_at_machine
 from flashdex.training.build import learner_device
-from flashdex.training.memory_library import find_library, read_sizes, worst_sizes
-from flashdex.training.memory_parts import Part, PartSizes, list_parts, replay_pool
+from flashdex.training.rehearsal import Rehearsal
+from flashdex.training.stand_in import Collection, find_library
 
 _LOG = logging.getLogger(__name__)
 TIGHT = 0.9  # share of what is free
 POOLS: tuple[Pool, ...] = ("gpu", "host", "disk")
+NAMES: dict[Pool, str] = {"gpu": "GPU memory", "host": "host memory", "disk": "disk"}
+# Allowances: what no rehearsal gives. On the GPU the contexts of torch and warp, their
+# kernels and workspaces, and gaps between blocks; on the host the same libraries.
+GPU_ALLOWANCE, HOST_ALLOWANCE = 3 << 29, 1 << 30
+# Parts that do not depend on what a collection holds.
+CERTAIN = {"replay rows", "stored replay rows", "CUDA", "libraries"}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One line of the plan: its bytes, where they lie, the product they are.
+
+    ``assumed`` marks the worst case of a collection that is not prepared yet.
+    """
+
+    name: str
+    pool: Pool
+    size: int
+    detail: str
+    assumed: bool = False
+
+
+def list_parts(recipe: Recipe, sizes: Rehearsal, *, device: Pool) -> list[Part]:
+    """Everything a run of the recipe allocates that is worth a line.
+
+    Args:
+        recipe: validated recipe.
+        sizes: of a recipe that differs in buffer, batch, worlds and replay only.
+        device: where the learner lives.
+    """
+    frames, objects = sizes.bank_bytes
+    counts = sizes.collection
+    about = f"{counts.objects} x {counts.points} points, {counts.nodes}^3 distances"
+    allowance = "allowance, not computed"
+    parts = [
+        *_learner(recipe, sizes, device),
+        *_physics(recipe, sizes, device),
+        Part(
+            "reference frames",
+            device,
+            frames,
+            f"{counts.frames:,} frames of {counts.motions} motions",
+        ),
+        Part("objects", device, objects, about),
+    ]
+    if device == "gpu":
+        about = "for storing rollouts"
+        parts.append(Part("references on the host", "host", frames + objects, about))
+        parts.append(Part("CUDA", "gpu", GPU_ALLOWANCE, allowance))
+    parts.append(Part("libraries", "host", HOST_ALLOWANCE, allowance))
+    return [
+        dataclasses.replace(p, assumed=not counts.known and p.name not in CERTAIN)
+        for p in parts
+    ]
+
+
+def replay_pool(recipe: Recipe, device: Pool) -> Pool:
+    """Where the replay rows lie: with the learner, or in host memory."""
+    return device if recipe.algo.replay in ("auto", "device") else "host"
+
+
+def _learner(recipe: Recipe, sizes: Rehearsal, device: Pool) -> Iterator[Part]:
+    algo, train, envs = recipe.algo, recipe.train, recipe.env.num_envs
+    nets, width = sizes.networks, sizes.row_bytes
+    about = (
+        f"weights {nets.weights / 1e6:,.0f}, gradients {nets.gradients / 1e6:,.0f}, "
+        f"Adam {nets.moments / 1e6:,.0f} MB"
+    )
+    yield Part("networks", device, nets.total, about)
+    if width:
+        rows, size = algo.buffer_size, algo.batch_size
+        yield _product("replay rows", replay_pool(recipe, device), rows, width)
+        ends = 2 * max(1, math.ceil(algo.updates_per_step)) * size + envs
+        each = sizes.input_bytes
+        yield _product("observations", device, ends, each, " while assembled")
+        about = f"{algo.n_step} steps of {envs} worlds"
+        tail = algo.n_step * envs * sizes.step_bytes
+        yield Part("n-step window", device, tail, about)
+        if train.checkpoint_replay:
+            rows = min(rows, recipe.total_env_steps)
+            yield _product("stored replay rows", "disk", rows, width)
+    else:
+        rows = envs * algo.ppo.horizon
+        size = -(-rows // algo.ppo.minibatches)
+        each = 2 * sizes.step_bytes + sizes.input_bytes  # collected and stacked
+        about = f" of {algo.ppo.horizon} steps, with their inputs"
+        yield _product("rollout", device, rows, each, about)
+    about = f"batch and activations of {size:,} rows, walked"
+    yield Part("update", device, sizes.update(size)[0], about)
+    one, kept = nets.weights + nets.moments, train.keep_checkpoints + 1
+    about = f"{kept} x {one / 1e6:,.0f} MB, one of them being written"
+    yield Part("checkpoints", "disk", kept * one, about)
+
+
+def _product(name: str, pool: Pool, rows: int, each: int, about: str = "") -> Part:
+    return Part(name, pool, rows * each, f"{rows:,} x {each:,} B{about}")
+
+
+def _physics(recipe: Recipe, sizes: Rehearsal, device: Pool) -> Iterator[Part]:
+    engine, env, counts = recipe.physics.engine, recipe.env, sizes.collection
+    # a GPU engine takes a GPU also beside a learner on the host
+    place: Pool = "gpu" if torch.cuda.is_available() else device
+    place = "host" if engine == "cpu" else place
+    scene = mujoco.mj_sizeModel(sizes.model)
+    about = f"{counts.motions} models x {scene:,} B"
+    yield Part("scenes", "host", counts.motions * scene, about)
+    dt = recipe.physics.timestep * recipe.physics.decimation
+    longest = min(counts.longest - 1, round(env.max_seconds / dt))
+    longest += LOOK_EVERY if place == "gpu" else 1
+    steps = round(env.attempt_share * env.num_envs) * longest
+    about = "last steps of the attempt worlds"
+    yield Part("attempts", place, steps * sizes.attempt_bytes, about)
+    envs = env.num_envs
+    if engine == "cpu":
+        threads = recipe.physics.num_threads or _cores()
+        world, thread = sizes.cpu
+        size = envs * world + threads * thread
+        about = f"{envs} worlds x {world:,} B, {threads} threads x {thread:,} B"
+    elif engine == "warp":
+        warp = sizes.warp
+        size = warp.fixed + envs * warp.per_world
+        about = (
+            f"{envs} worlds x {warp.per_world:,} B with room for "
+            f"{warp.room.contacts} contacts, {warp.room.rows} constraint rows"
+        )
+    else:
+        size, about = 0, "brax: not computed, JAX reserves memory by its own settings"
+    yield Part("physics", place, size, about)
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -41,18 +181,12 @@ class MemoryPlan:
     device: Pool
     parts: list[Part]
     machine: Machine
-    sizes: PartSizes = field(repr=False)
+    sizes: Rehearsal = field(repr=False)
 
     def need(self, pool: Pool, *, certain: bool = False) -> int:
-        """Bytes that a pool must give.
-
-        Args:
-            pool: which.
-            certain: leave out what is assumed of an unprepared collection.
-        """
-        return sum(
-            p.size for p in self.parts if p.pool == pool and not (certain and p.assumed)
-        )
+        """Bytes that a pool must give; ``certain`` leaves out what is assumed."""
+        parts = (p for p in self.parts if p.pool == pool)
+        return sum(p.size for p in parts if not (certain and p.assumed))
 
     def share(self, pool: Pool, *, certain: bool = False) -> float:
         """Need over what is free; 0 where nobody knows what is free."""
@@ -77,12 +211,12 @@ class MemoryPlan:
     @property
     def largest_buffer(self) -> int:
         """Most replay rows that fit where they are planned, two digits."""
-        pool = replay_pool(self.recipe, self.device)
-        free, width = self.machine.free(pool), self.sizes.learner.row_bytes
-        if free is None or self.recipe.algo.kind == "ppo":
-            return self.recipe.algo.buffer_size
-        rows = self.recipe.algo.buffer_size * width
-        return round_down(int(TIGHT * free - (self.need(pool) - rows)) // width)
+        pool, wanted = replay_pool(self.recipe, self.device), self.recipe.algo
+        free, width = self.machine.free(pool), self.sizes.row_bytes
+        if free is None or not width:
+            return wanted.buffer_size
+        rest = self.need(pool) - wanted.buffer_size * width
+        return round_down(int(TIGHT * free - rest) // width)
 
     def change(self, **values: object) -> MemoryPlan:
         """The plan with other values of ``part.key``, written ``part__key``."""
@@ -134,8 +268,8 @@ def plan_memory(
     if device is None:
         device = "gpu" if learner_device(recipe).type == "cuda" else "host"
     library = library or find_library(recipe)
-    collection = worst_sizes(recipe) if library is None else read_sizes(library)
-    sizes = PartSizes(recipe, collection)
+    known = None if library is None else Collection.of(library)
+    sizes = Rehearsal(recipe, known or Collection.assumed(recipe))
     machine = machine or look_at_machine(run_dir or Path())
     parts = list_parts(recipe, sizes, device=device)
     return MemoryPlan(recipe, device, parts, machine, sizes)
@@ -143,55 +277,94 @@ def plan_memory(
 
 def overrides_that_fit(plan: MemoryPlan) -> list[str]:
     """Changes that make a plan fit, each a line of ``key=value`` words by itself."""
-    return list(_search(plan)) or list(_smaller_in_all(plan))
-
-
-def _search(plan: MemoryPlan) -> Iterator[str]:
-    recipe = plan.recipe
+    recipe, found = plan.recipe, []
     if recipe.train.checkpoint_replay:
-        unstored = plan.change(train__checkpoint_replay=False)
-        if unstored.fits:
-            yield "train.checkpoint_replay=false"
-    if recipe.algo.kind != "ppo":
-        if rows := _enough_rows(plan):
-            yield f"algo.buffer_size={rows}"
-        if plan.device == "gpu" and recipe.algo.replay != "pinned":
-            moved = plan.change(algo__replay="pinned")
-            if moved.fits:
-                yield "algo.replay=pinned"
-            elif rows := _enough_rows(moved):
-                yield f"algo.replay=pinned algo.buffer_size={rows}"
-    for part, key in (("env", "num_envs"), ("algo", "batch_size")):
-        value = getattr(getattr(recipe, part), key) // 2
-        while value >= 2:
-            if plan.change(**{f"{part}__{key}": value}).fits:
-                yield f"{part}.{key}={value}"
-                break
-            value //= 2
+        found.append(_change(plan, fewer_rows=False, train__checkpoint_replay=False))
+    found.append(_change(plan))
+    if plan.sizes.row_bytes and replay_pool(recipe, plan.device) == "gpu":
+        found.append(_change(plan, algo__replay="pinned"))
+    envs, size = recipe.env.num_envs, recipe.algo.batch_size
+    for key, value in (("env__num_envs", envs), ("algo__batch_size", size)):
+        halves = ({key: value >> i} for i in range(1, value.bit_length() - 1))
+        found.append(_first(plan, halves, fewer_rows=False))
+    if not any(found):
+        steps = range(1, min(envs, size).bit_length() - 1)
+        both = (
+            {"env__num_envs": envs >> i, "algo__batch_size": size >> i} for i in steps
+        )
+        found.append(_first(plan, both, fewer_rows=True))
+    return [words for words in found if words]
 
 
-def _smaller_in_all(plan: MemoryPlan) -> Iterator[str]:
-    """Fewer worlds, a smaller batch and, where there is one, a smaller buffer."""
-    envs, size = plan.recipe.env.num_envs, plan.recipe.algo.batch_size
-    while min(envs, size) >= 4:
-        envs, size = envs // 2, size // 2
-        smaller = plan.change(env__num_envs=envs, algo__batch_size=size)
-        words = f"env.num_envs={envs} algo.batch_size={size}"
-        if smaller.fits:
-            yield words
-            return
-        if rows := _enough_rows(smaller):
-            yield f"{words} algo.buffer_size={rows}"
-            return
+def _first(
+    plan: MemoryPlan, options: Iterator[dict[str, int]], *, fewer_rows: bool
+) -> str:
+    tried = (_change(plan, fewer_rows=fewer_rows, **values) for values in options)
+    return next((words for words in tried if words), "")
 
 
-def _enough_rows(plan: MemoryPlan) -> int:
-    """The largest buffer where that alone makes the plan fit, else 0."""
-    algo, rows = plan.recipe.algo, plan.largest_buffer
-    wanted = max(algo.min_buffer, algo.batch_size)
-    if not wanted <= rows < algo.buffer_size:
-        return 0
-    return rows if plan.change(algo__buffer_size=rows).fits else 0
+def _change(plan: MemoryPlan, *, fewer_rows: bool = True, **values: object) -> str:
+    """A change in words where it fits, if need be with fewer rows; else empty."""
+    changed = plan.change(**values)
+    words = [f"{k.replace('__', '.')}={str(v).lower()}" for k, v in values.items()]
+    if changed.fits and words:
+        return " ".join(words)
+    algo, rows = changed.recipe.algo, changed.largest_buffer
+    enough = max(algo.min_buffer, algo.batch_size) <= rows < algo.buffer_size
+    if fewer_rows and enough and changed.change(algo__buffer_size=rows).fits:
+        return " ".join([*words, f"algo.buffer_size={rows}"])
+    return ""
+
+
+def format_size(size: int) -> str:
+    """Bytes in decimal units, three digits."""
+    value = float(size)
+    for unit in ("B", "kB", "MB"):
+        if value < 999.5:
+            return f"{value:.3g} {unit}"
+        value /= 1000
+    return f"{value:,.0f} GB" if value >= 99.5 else f"{value:.3g} GB"
+
+
+def used(plan: MemoryPlan, *pools: Pool) -> str:
+    """Need of each pool, and what it has."""
+    return "; ".join(
+        f"{NAMES[p]} {format_size(plan.need(p))} of "
+        f"{format_size(plan.machine.free(p) or 0)} free"
+        for p in pools
+    )
+
+
+def assumption(plan: MemoryPlan) -> str:
+    """What is assumed of motions that are not prepared; empty where they are."""
+    counts = plan.sizes.collection
+    if counts.known:
+        return ""
+    return (
+        f"the motions are not prepared yet: {counts.motions} motions of "
+        f"{counts.longest / counts.fps:g} s with {counts.objects} objects are assumed"
+    )
+
+
+def _refusal(plan: MemoryPlan) -> str:
+    lines = [
+        f"{plan.recipe.name}: this machine has too little memory: "
+        f"{used(plan, *plan.short)}."
+    ]
+    largest = sorted(plan.parts, key=lambda p: p.size, reverse=True)
+    for pool in plan.short:
+        tops = [p for p in largest if p.pool == pool][:3]
+        named = ", ".join(f"{p.name} {format_size(p.size)}" for p in tops)
+        lines.append(f"  most of the {NAMES[pool]}: {named}")
+    if found := overrides_that_fit(plan):
+        lines += ["Any of these fits:", *(f"  {words}" for words in found)]
+    else:
+        lines.append(
+            "No smaller buffer, batch or number of worlds is enough: use a machine "
+            "with more memory."
+        )
+    lines.append(f"All parts: flashdex doctor {plan.recipe.name}")
+    return "\n".join(lines)
 
 
 def check_memory(
@@ -199,22 +372,17 @@ def check_memory(
 ) -> str:
     """Refuse a run that cannot fit, before anything is allocated.
 
-    Args:
-        recipe: validated recipe.
-        library: its motions; see `plan_memory`.
-        run_dir: where checkpoints go.
-
     Returns:
         One line about what the run will need. Where it is tight a warning is logged.
 
     Raises:
         FlashdexError: some memory is certainly too small; says which overrides fit.
     """
-    from flashdex.training.memory_text import refusal, summary, tight_warning
-
     plan = plan_memory(recipe, library=library, run_dir=run_dir)
     if not plan.fits:
-        raise FlashdexError(refusal(plan))
+        raise FlashdexError(_refusal(plan))
     if plan.tight:
-        _LOG.warning("%s", tight_warning(plan))
-    return summary(plan)
+        note = f" ({assumption(plan)})" if assumption(plan) else ""
+        _LOG.warning("memory is tight: %s%s", used(plan, *plan.tight), note)
+    known = (p for p in POOLS if plan.need(p) and plan.machine.free(p) is not None)
+    return f"memory: {', '.join(used(plan, pool) for pool in known)}"

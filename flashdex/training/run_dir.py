@@ -34,8 +34,8 @@ from flashdex.training.checkpoint import (
     set_aside_newer,
 )
 from flashdex.training.memory import check_memory
-from flashdex.training.memory_library import find_library
 from flashdex.training.session import end_session, refuse_changes
+from flashdex.training.stand_in import find_library
 
 _LOG = logging.getLogger(__name__)
 VERSIONS = "versions.json"

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.cli.memory_report import format_cards, format_plan
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
@@ -16,16 +17,17 @@ from flashdex.recipe import Recipe
 from flashdex.system.machine import Machine
 from flashdex.training import memory
 from flashdex.training.memory import (
+    GPU_ALLOWANCE,
     MemoryPlan,
     check_memory,
+    format_size,
+    list_parts,
     overrides_that_fit,
     plan_memory,
     round_down,
 )
-from flashdex.training.memory_library import read_sizes
-from flashdex.training.memory_parts import GPU_ALLOWANCE, list_parts
-from flashdex.training.memory_text import format_cards, format_plan, format_size
-from flashdex.training.memory_walk import tensor_bytes
+from flashdex.training.rehearsal import PeakMeter, tensor_bytes
+from flashdex.training.stand_in import Collection
 
 GB = 10**9
 ROOMY = Machine(gpu=None, host=100 * GB, disk=100 * GB)
@@ -94,7 +96,7 @@ def test_replay_rows_are_exact(trained, rows):
 )
 def test_networks_are_exact(trained, algo):
     _, learner, plan = trained(algo=algo)
-    nets, stepper = plan.sizes.learner.networks, learner.agent.stepper
+    nets, stepper = plan.sizes.networks, learner.agent.stepper
     loss = learner.agent.loss
     everything = [p for _, p in nn.Module.named_parameters(loss)]
     own = [
@@ -136,9 +138,45 @@ def test_the_rings_of_attempts_are_exact(trained):
 def test_the_window_of_n_steps_is_exact(trained):
     _, learner, plan = trained(algo={"n_step": 4})
     steps = learner.nstep.state_dict()["steps"]
-    # what the row's `steps` counter is, is a flag `done` here: 8 bytes against 1
-    spared = len(steps) * 6 * 7
-    assert part(plan, "n-step window").size == tensor_bytes(steps) + spared
+    assert part(plan, "n-step window").size == tensor_bytes(steps)
+
+
+LEARNER = (*("replay rows", "networks", "update", "observations"), "rollout")
+
+
+@pytest.mark.parametrize("kind", ["flashsac", "ppo"])
+def test_the_learner_takes_no_more_than_planned(make_bench, collect, kind):
+    wide = {"actor_width": 64, "critic_width": 128, "buffer_size": 2000}
+    bench = make_bench(16, algo={"kind": kind, "batch_size": 256, **wide})
+    plan = plan_memory(bench.recipe, library=bench.library, machine=ROOMY)
+    env = bench.make_env()
+    with PeakMeter() as meter:
+        learner = bench.make_learner(env)
+        for _ in range(2):  # Adam's moments are there in the second round
+            collect(env, learner, 24)
+            learner.due()
+            learner.update()
+    planned = sum(p.size for p in plan.parts if p.name in LEARNER)
+    # samples are assembled before the update, so that both peaks are not there at once
+    assert meter.peak <= planned <= 1.3 * meter.peak
+
+
+@pytest.mark.gpu
+def test_a_gpu_takes_no_more_than_planned(make_bench, collect):
+    wide = {"actor_width": 128, "critic_width": 512, "buffer_size": 100_000}
+    options = {"device": "cuda", "batch_size": 4096, "compile": False, **wide}
+    bench = make_bench(64, algo=options)
+    plan = plan_memory(bench.recipe, library=bench.library, machine=ROOMY, device="gpu")
+    env = bench.make_env()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    learner = bench.make_learner(env)
+    collect(env, learner, 24)
+    for _ in range(2):
+        learner.update()
+    planned = sum(p.size for p in plan.parts if p.name in LEARNER)
+    peak = torch.cuda.max_memory_allocated() - before
+    assert 0.7 * planned < peak < 1.1 * planned
 
 
 def test_the_cpu_engine_is_exact(trained):
@@ -155,7 +193,7 @@ def test_unprepared_motions_are_the_worst_case(plan, tmp_path):
     worst = plan_memory(recipe, machine=ROOMY)
     assert not worst.sizes.collection.known
     assert part(worst, "reference frames").size > part(plan, "reference frames").size
-    assert worst.sizes.learner.row_bytes >= plan.sizes.learner.row_bytes
+    assert worst.sizes.row_bytes >= plan.sizes.row_bytes
     assert "not prepared yet: 3 motions" in format_plan(worst)
     # a guess alone refuses nothing
     assumed = worst.need("host") - worst.need("host", certain=True)
@@ -166,14 +204,15 @@ def test_unprepared_motions_are_the_worst_case(plan, tmp_path):
 
 
 def test_sizes_of_a_library(library):
-    sizes = read_sizes(library)
+    sizes = Collection.of(library)
     assert (sizes.motions, sizes.frames, sizes.longest) == (3, 123, 52)
-    assert (sizes.objects, sizes.hands, sizes.parts) == (2, (True, True), (1, 1))
+    assert (sizes.objects, sizes.layout.sides) == (2, ("left", "right"))
+    assert sizes.layout.num_parts == (1, 1)
 
 
 def test_more_than_there_is_does_not_fit(plan):
     plan = plan.change(algo__buffer_size=30_000_000, algo__replay="device")
-    row = plan.sizes.learner.row_bytes
+    row = plan.sizes.row_bytes
     rest = plan.need("host") - 30_000_000 * row
     exact = Machine(None, host=plan.need("host"), disk=GB)
     assert plan.on(exact).fits
@@ -199,7 +238,7 @@ def test_rows_move_to_pinned_memory(plan):
     assert "algo.replay=pinned" in overrides_that_fit(large)
     pinned = large.change(algo__replay="pinned")
     moved = large.need("gpu") - pinned.need("gpu")
-    assert moved == 50_000_000 * plan.sizes.learner.row_bytes
+    assert moved == 50_000_000 * plan.sizes.row_bytes
     assert pinned.need("host") == large.need("host") + moved
     assert pinned.largest_buffer > large.largest_buffer > 0
     both = dataclasses.replace(large.machine, host=20 * GB)
@@ -238,7 +277,7 @@ def test_several_changes_where_one_is_not_enough(plan):
 
 def test_stored_rows_need_disk(plan):
     plan = plan.change(train__checkpoint_replay=True)
-    row = plan.sizes.learner.row_bytes
+    row = plan.sizes.row_bytes
     assert part(plan, "stored replay rows").size == 400 * row
     full = plan.on(Machine(None, 100 * GB, disk=plan.need("disk") - 1))
     assert overrides_that_fit(full)[0] == "train.checkpoint_replay=false"
@@ -270,10 +309,10 @@ def test_cards_hold_what_fits(plan):
     lines = format_cards(large).splitlines()[1:]
     assert [line.split()[0] for line in lines] == ["24", "48", "80", "141"]
     assert "all 50,000,000 rows" in lines[3]
-    rest = large.need("gpu") - 50_000_000 * large.sizes.learner.row_bytes
+    rest = large.need("gpu") - 50_000_000 * large.sizes.row_bytes
     assert rest > GPU_ALLOWANCE
     usable = int(0.9 * int(24e9 * 0.97)) - rest
-    rows = round_down(usable // large.sizes.learner.row_bytes)
+    rows = round_down(usable // large.sizes.row_bytes)
     assert f"{rows:,} rows" in lines[0]
 
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from flashdex.envs.scene.scene import Scene
+from flashdex import keys
+from flashdex.envs.physics.state_map import StateMap
+from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.scene.wrench import ObjectWrench
+from flashdex.hands.spec import HandSpec
+from flashdex.motions.library import MotionLibrary
+
+if TYPE_CHECKING:
+    from flashdex.envs.physics.config import PhysicsConfig
 
 
 @dataclass(frozen=True)
@@ -106,3 +113,45 @@ class Physics(Protocol):
         or constraints are missing. Empty where nothing overflowed.
         """
         ...
+
+
+class Engine:
+    """What every engine is built from: scenes, their state map, a motion a world.
+
+    Args:
+        library: the prepared collection; one scene is compiled for each motion.
+        hands: hand specs by side.
+        physics: engine settings of the recipe.
+        num_envs: worlds N.
+        device: where states live.
+    """
+
+    def __init__(
+        self,
+        library: MotionLibrary,
+        hands: dict[keys.Side, HandSpec],
+        physics: PhysicsConfig,
+        num_envs: int,
+        device: torch.device,
+    ) -> None:
+        self.num_envs, self.device = num_envs, device
+        self.decimation = physics.decimation
+        self.step_dt = physics.timestep * physics.decimation
+        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        self.map = StateMap(library, hands, self.scenes[0]).to(device)
+        self._motion = torch.zeros(num_envs, dtype=torch.long, device=device)
+
+    def _state(
+        self, qpos: Tensor, qvel: Tensor, contact: Tensor, bad: Tensor
+    ) -> TensorDict:
+        """``Physics.state`` of flat states and the contact of hands that exist."""
+        pos, vel, pose, object_vel = self.map.read(qpos, qvel, self._motion)
+        out = {
+            keys.JOINT_POS: pos,
+            keys.JOINT_VEL: vel,
+            keys.OBJECT_POSE: pose,
+            keys.OBJECT_VEL: object_vel,
+            keys.CONTACT: self.map.read_contact(contact, self._motion),
+            "bad": bad,
+        }
+        return TensorDict(out, batch_size=[self.num_envs])

@@ -12,9 +12,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import RawState
-from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.scene.scene import Scene, build_scenes
+from flashdex.envs.physics.base import Engine, RawState
+from flashdex.envs.scene.scene import Scene
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
@@ -36,15 +35,8 @@ _FULL = {
 }
 
 
-class CpuPhysics:
-    """``mujoco.batch`` with one model a motion; see ``Physics``.
-
-    Args:
-        library: the prepared collection; one scene is compiled for each motion.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-        num_envs: worlds N.
-    """
+class CpuPhysics(Engine):
+    """``mujoco.batch`` with one model a motion; see ``Physics`` and ``Engine``."""
 
     def __init__(
         self,
@@ -53,14 +45,9 @@ class CpuPhysics:
         physics: PhysicsConfig,
         num_envs: int,
     ) -> None:
-        self.num_envs = num_envs
-        self.device = torch.device("cpu")
-        self.decimation = physics.decimation
-        self.step_dt = physics.timestep * physics.decimation
-        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        super().__init__(library, hands, physics, num_envs, torch.device("cpu"))
         scene = self.scenes[0]
         self.layout = layout = scene.layout
-        self.map = StateMap(library, hands, scene)
         self.batch = Batch(scene.model, nsim=num_envs, nthread=physics.num_threads)
         self._models = [scene.model] * num_envs
         self.batch.set_models(self._models)
@@ -73,7 +60,6 @@ class CpuPhysics:
         self._xfrc = self.batch.bind("xfrc_applied")
         self._sensor = self.batch.bind("sensordata")  # read-only: no torch view
         self._wrench = torch.zeros(num_envs, self.map.num_slots, 6)
-        self._motion = torch.zeros(num_envs, dtype=torch.long)
         self._bad_before = np.zeros(num_envs, dtype=np.int64)
         self._full_before = self._count(list(_FULL.values()))
         self._full = np.zeros((num_envs, len(_FULL)), dtype=bool)
@@ -96,13 +82,8 @@ class CpuPhysics:
         self._note_overflow()  # the reset forgets it
         self._set_models(ids.tolist())
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        qpos, qvel, ctrl = self.map.write(
-            motion[rows],
-            joint_pos[rows],
-            joint_vel[rows],
-            object_pose[rows],
-            object_vel[rows],
-        )
+        given = (motion, joint_pos, joint_vel, object_pose, object_vel)
+        qpos, qvel, ctrl = self.map.write(*(x[rows] for x in given))
         self._qpos[rows], self._qvel[rows], self._ctrl[rows] = qpos, qvel, ctrl
         self.batch.forward(ids=ids)
         self._bad_before[ids] = self._count(_BAD)[ids].sum(-1)
@@ -133,17 +114,9 @@ class CpuPhysics:
 
     def state(self) -> TensorDict:
         """Current state in the layout of ``flashdex.keys``; see ``Physics.state``."""
-        pos, vel, pose, object_vel = self.map.read(self._qpos, self._qvel, self._motion)
         contact = torch.from_numpy(self._sensor[:, self._sensor_adr])
-        out = {
-            keys.JOINT_POS: pos,
-            keys.JOINT_VEL: vel,
-            keys.OBJECT_POSE: pose,
-            keys.OBJECT_VEL: object_vel,
-            keys.CONTACT: self.map.read_contact(contact, self._motion),
-            "bad": torch.from_numpy(self._count(_BAD).sum(-1) > self._bad_before),
-        }
-        return TensorDict(out, batch_size=[self.num_envs])
+        bad = torch.from_numpy(self._count(_BAD).sum(-1) > self._bad_before)
+        return self._state(self._qpos, self._qvel, contact, bad)
 
     def raw(self) -> RawState:
         """Views of the full-precision state; see ``Physics.raw``."""

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 def engine_device(physics: PhysicsConfig) -> torch.device:
     """Where the engine's states live: warp and brax use a GPU where they see one.
 
-    Args:
-        physics: engine settings of the recipe.
-
     Raises:
         FlashdexError: its packages are missing.
     """
@@ -41,10 +38,6 @@ def engine_device(physics: PhysicsConfig) -> torch.device:
 def check_engine(library: MotionLibrary, physics: PhysicsConfig) -> None:
     """Refuse what an engine cannot run, before anything is built.
 
-    Args:
-        library: the prepared collection.
-        physics: engine settings of the recipe.
-
     Raises:
         FlashdexError: packages are missing, or the collection is not for this engine.
     """
@@ -62,12 +55,6 @@ def make_physics(
     num_envs: int,
 ) -> Physics:
     """Build the engine that ``physics.engine`` names.
-
-    Args:
-        library: the prepared collection.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-        num_envs: worlds N.
 
     Raises:
         FlashdexError: its packages are missing, or it cannot run this collection.

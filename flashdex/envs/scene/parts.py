@@ -49,12 +49,7 @@ def pad_bvh(spec: mujoco.MjSpec, nodes: int) -> None:
 
 
 def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
-    """Set time step, solver and contact model of a scene.
-
-    Args:
-        spec: scene under construction.
-        physics: engine settings of the recipe.
-    """
+    """Set time step, solver and contact model of a scene."""
     option = spec.option
     option.timestep = physics.timestep
     option.iterations = physics.iterations
@@ -69,13 +64,7 @@ def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
 
 
 def set_hand_friction(spec: mujoco.MjSpec, side: keys.Side, friction: float) -> None:
-    """Give all geoms of one hand its collision bits and sliding friction.
-
-    Args:
-        spec: scene that holds the hand.
-        side: which hand.
-        friction: sliding coefficient, no unit.
-    """
+    """Give all geoms of one hand its collision bits and sliding friction."""
     for geom in spec.geoms:
         if geom.parent.name.startswith(f"{side}_"):
             geom.contype, geom.conaffinity = HAND_BITS
@@ -115,13 +104,7 @@ def add_object(
 
 
 def add_part_mesh(spec: mujoco.MjSpec, name: str, vertices: np.ndarray) -> None:
-    """Add one convex part as a mesh asset.
-
-    Args:
-        spec: scene under construction.
-        name: of the asset.
-        vertices: object axes, m, (V, 3).
-    """
+    """Add one convex part as a mesh asset."""
     mesh = spec.add_mesh(name=name)
     mesh.uservert = np.asarray(vertices, np.float64).reshape(-1)
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
@@ -144,12 +127,6 @@ def add_object_of_meshes(
 
     Its mass is a placeholder: engines that swap objects write the numbers of the
     object a world holds.
-
-    Args:
-        spec: scene that holds the assets.
-        meshes: names of the assets, one a part.
-        slot: object slot; the body is called ``object<slot>``.
-        physics: friction and contact dimension.
     """
     body = spec.worldbody.add_body(name=f"object{slot}")
     body.add_freejoint(name=f"object{slot}")
@@ -216,14 +193,7 @@ def add_supports(spec: mujoco.MjSpec, discs: Tensor, physics: PhysicsConfig) -> 
 def add_contact_sensors(
     spec: mujoco.MjSpec, hand: HandSpec, slot: int, suffix: str = ""
 ) -> None:
-    """Add a sensor a link: net force and point of its contact with one object.
-
-    Args:
-        spec: scene that holds the hand and the object.
-        hand: the hand whose links are sensed.
-        slot: slot of the object.
-        suffix: ends the sensors' names, where there are several sets.
-    """
+    """Add a sensor a link: net force and point of its contact with one object."""
     for link in hand.link_names:
         # Ordered object first: the sensor then reports the force ON the link.
         spec.add_sensor(

@@ -96,15 +96,13 @@ class Scene:
 
     def joint_qpos(self, side: keys.Side) -> np.ndarray:
         """Addresses of one hand's joints in qpos, (J,)."""
-        return np.array(
-            [self.model.joint(n).qposadr[0] for n in self.hands[side].joint_names]
-        )
+        names = self.hands[side].joint_names
+        return np.array([self.model.joint(n).qposadr[0] for n in names])
 
     def joint_dof(self, side: keys.Side) -> np.ndarray:
         """Addresses of one hand's joints in qvel, (J,)."""
-        return np.array(
-            [self.model.joint(n).dofadr[0] for n in self.hands[side].joint_names]
-        )
+        names = self.hands[side].joint_names
+        return np.array([self.model.joint(n).dofadr[0] for n in names])
 
     def joint_actuator(self, side: keys.Side) -> np.ndarray:
         """Actuators of one hand in joint order, (J,)."""
@@ -130,13 +128,7 @@ class Scene:
 def build_scenes(
     library: MotionLibrary, hands: dict[keys.Side, HandSpec], physics: PhysicsConfig
 ) -> list[Scene]:
-    """Build the scenes of all motions of a collection, of one layout.
-
-    Args:
-        library: the prepared collection.
-        hands: hand specs by side.
-        physics: time step, solver, gains, friction.
-    """
+    """Build the scenes of all motions of a collection, of one layout."""
     layout = SceneLayout.of(library)
     specs = [
         _make_spec(library, m, hands, physics, layout)
@@ -159,13 +151,7 @@ def make_hands_spec(
     hands: dict[keys.Side, HandSpec],
     physics: PhysicsConfig,
 ) -> mujoco.MjSpec:
-    """Begin a scene: options and hands, with their gains and friction.
-
-    Args:
-        sides: hands that the scene has.
-        hands: hand specs by side.
-        physics: time step, solver, gains, friction.
-    """
+    """Begin a scene: options and hands, with their gains and friction."""
     spec = mujoco.MjSpec()
     set_options(spec, physics)
     for side in sides:

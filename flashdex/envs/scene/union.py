@@ -60,13 +60,6 @@ def build_union(
 ) -> SceneUnion:
     """Build the union of the scenes of a collection.
 
-    Args:
-        library: the collection the scenes were built from.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-        scenes: compiled scene of each motion, of one layout.
-        fields: arrays of the model that the engine reads.
-
     Raises:
         FlashdexError: a convex part has another shape in the union than in a scene.
     """
@@ -75,10 +68,8 @@ def build_union(
     spec.compile()
     # From text as the scenes are, so that vertices are rounded alike.
     model = mujoco.MjModel.from_xml_string(spec.to_xml())
-    rows = {}
-    mesh_ids = np.stack(
-        [_mesh_ids(library, m, scenes, model) for m in range(len(scenes))]
-    )
+    motions, rows = range(len(scenes)), {}
+    mesh_ids = np.stack([_mesh_ids(library, m, scenes, model) for m in motions])
     unused = np.stack([_unused(s.model, model) for s in scenes])
     for name in fields:
         own = getattr(model, name, None)
@@ -176,11 +167,9 @@ def _contact(
     if layout.num_objects == 0:
         return out
     for i, side in enumerate(layout.sides):
+        names = hands[side].link_names
         start = [
-            [
-                union.sensor(f"contact_{n}_object{s}").adr[0]
-                for n in hands[side].link_names
-            ]
+            [union.sensor(f"contact_{n}_object{s}").adr[0] for n in names]
             for s in range(layout.num_objects)
         ]
         slots = own[:, keys.SIDES.index(side)]

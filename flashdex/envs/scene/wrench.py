@@ -123,20 +123,8 @@ def assist_wrench(
     ``tau = I_w [ratio kp rotvec(R_ref R^T) + sqrt(ratio) kv (w_ref - w)]``,
     each component clamped.
 
-    Args:
-        pose: object position and quaternion, world, (N, O, 7).
-        vel: linear and angular velocity, world, (N, O, 6).
-        ref_pose: reference, (N, O, 7).
-        ref_vel: reference, (N, O, 6).
-        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
-        kp: stiffness of each world, N/m, (N,).
-        kv: damping of each world, N s/m, (N,).
-        torque_ratio: angular over linear stiffness.
-        force_limit: N.
-        torque_limit: N m.
-
-    Returns:
-        Force and torque in world axes, (N, O, 6).
+    Arguments are those of `ObjectWrench` and its call; force and torque, world axes,
+    (N, O, 6).
     """
     kp, kv = kp[:, None, None], kv[:, None, None]
     force = kp * (ref_pose[..., :3] - pose[..., :3])
@@ -169,18 +157,9 @@ def hold_wrench(
     gravity included: ``F = share m (w^2 (x_ref - x) + 2 w (v_ref - v) + g)``, torques
     alike with the inertia.
 
-    Args:
-        pose: object position and quaternion, world, (N, O, 7).
-        vel: linear and angular velocity, world, (N, O, 6).
-        ref_pose: reference, (N, O, 7).
-        ref_vel: reference, (N, O, 6).
-        mass: kg, (N, O).
-        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
-        share: 1 right after the reset, falling to 0, (N,).
-        stiffness: w, rad/s.
-
-    Returns:
-        Force and torque in world axes, (N, O, 6).
+    ``share`` is 1 right after the reset and falls to 0, (N,); ``stiffness`` is w,
+    rad/s. Other arguments are those of `ObjectWrench` and its call; force and torque,
+    world axes, (N, O, 6).
     """
     quat = pose[..., 3:]
     turn = quat_to_rotvec(quat_mul(ref_pose[..., 3:], quat_conj(quat)))

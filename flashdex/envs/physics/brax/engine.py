@@ -20,9 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import RawState
-from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.scene.scene import Scene, build_scenes
+from flashdex.envs.physics.base import Engine, RawState
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError, MissingExtraError
 from flashdex.hands.spec import HandSpec
@@ -47,17 +45,11 @@ def brax_device() -> torch.device:
     return set_up()
 
 
-class BraxPhysics:
+class BraxPhysics(Engine):
     """brax's MJX pipeline on all worlds at once; see ``Physics``.
 
     The first step compiles for about a minute with one hand, longer with more; the
     program is kept in ``~/.cache/flashdex/jax`` (or ``JAX_COMPILATION_CACHE_DIR``).
-
-    Args:
-        library: the prepared collection; all motions must use the same objects.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-        num_envs: worlds N.
 
     Raises:
         MissingExtraError: brax is not installed.
@@ -72,24 +64,16 @@ class BraxPhysics:
         num_envs: int,
     ) -> None:
         refuse_unlike_objects(library)
-        brax_device()
+        super().__init__(library, hands, physics, num_envs, brax_device())
         import flashdex.envs.physics.brax.step as code
-        import flashdex.envs.physics.brax.step as share
         from flashdex.envs.physics.brax.model import build_model
         from flashdex.envs.physics.brax.wrench import wrench_inputs
 
-        self._share, self._code, self._wrench_inputs = share, code, wrench_inputs
-        self.num_envs = num_envs
-        self.device = share.set_up()
-        self.decimation = physics.decimation
-        self.step_dt = physics.timestep * physics.decimation
-        self.scenes: list[Scene] = build_scenes(library, hands, physics)
-        self.map = StateMap(library, hands, self.scenes[0]).to(self.device)
+        self._code, self._wrench_inputs = code, wrench_inputs
         self.model = build_model(self.scenes)
         sides = [keys.SIDES.index(s) for s in self.scenes[0].layout.sides]
-        own_slot = share.to_jax(self.map.own_slot[:, sides])
+        own_slot = code.to_jax(self.map.own_slot[:, sides])
         self._advance = code.make_advance(self.model, own_slot)
-        self._motion = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         slots = self.map.num_slots
         self._worlds = code.empty_worlds(self.model, num_envs, slots)
         self._no_wrench = self._inputs(_no_wrench(num_envs, slots, self.device))
@@ -104,13 +88,13 @@ class BraxPhysics:
         object_vel: Tensor,
     ) -> None:
         """Put worlds into given states; see ``Physics.reset``."""
-        share, code = self._share, self._code
+        code = self._code
         self._motion = torch.where(mask, motion.long(), self._motion)
         state = self.map.write(
             self._motion, joint_pos, joint_vel, object_pose, object_vel
         )
-        chosen = share.to_jax(mask)
-        flat = [share.to_jax(x) for x in (*state, self._motion)]
+        chosen = code.to_jax(mask)
+        flat = [code.to_jax(x) for x in (*state, self._motion)]
         placed = code.place(self._worlds, chosen, *flat)
         # Contacts at the new state: a substep whose motion is thrown away, and none
         # where no world is reset.
@@ -119,32 +103,22 @@ class BraxPhysics:
 
     def step(self, target: Tensor, wrench: ObjectWrench | None = None) -> None:
         """Advance one control step; see ``Physics.step``."""
-        ctrl = self._share.to_jax(self.map.controls(self._motion, target))
+        ctrl = self._code.to_jax(self.map.controls(self._motion, target))
         act = self._no_wrench if wrench is None else self._inputs(wrench)
-        substeps = self._share.to_jax(torch.tensor(self.decimation))
+        substeps = self._code.to_jax(torch.tensor(self.decimation))
         self._worlds = self._advance(self._worlds._replace(ctrl=ctrl), act, substeps)
 
     def state(self) -> TensorDict:
         """Current state in the layout of ``flashdex.keys``; see ``Physics.state``."""
-        now, view = self._worlds, self._share.to_torch
-        pos, vel, pose, object_vel = self.map.read(
-            view(now.qpos), view(now.qvel), self._motion
-        )
-        out = {
-            keys.JOINT_POS: pos,
-            keys.JOINT_VEL: vel,
-            keys.OBJECT_POSE: pose,
-            keys.OBJECT_VEL: object_vel,
-            keys.CONTACT: self.map.read_contact(view(now.contact), self._motion),
-            "bad": view(now.bad).clone(),
-        }
-        return TensorDict(out, batch_size=[self.num_envs])
+        now, view = self._worlds, self._code.to_torch
+        flat = (view(now.qpos), view(now.qvel), view(now.contact))
+        return self._state(*flat, view(now.bad).clone())
 
     def raw(self) -> RawState:
         """Copies of the state, float32; see ``Physics.raw``."""
         now = self._worlds
         parts = (now.qpos, now.qvel, now.ctrl, now.wrench)
-        return RawState(*[self._share.to_torch(x).clone() for x in parts])
+        return RawState(*[self._code.to_torch(x).clone() for x in parts])
 
     def take_overflow(self) -> dict[str, int]:
         """Worlds that may have lost contacts since the last call; see the protocol.
@@ -158,14 +132,11 @@ class BraxPhysics:
         return {"contacts": worlds} if worlds else {}
 
     def _inputs(self, wrench: ObjectWrench) -> WrenchInputs:
-        return self._wrench_inputs(wrench, self._share.to_jax)
+        return self._wrench_inputs(wrench, self._code.to_jax)
 
 
 def refuse_unlike_objects(library: MotionLibrary) -> None:
     """Check that all motions use the same objects in the same slots.
-
-    Args:
-        library: the prepared collection.
 
     Raises:
         FlashdexError: names the first motion that differs from the first one.

@@ -60,11 +60,7 @@ class BraxModel:
 
 
 def build_model(scenes: list[Scene]) -> BraxModel:
-    """Build the system of scenes that contain the same objects.
-
-    Args:
-        scenes: scene of each motion, of one layout.
-    """
+    """Build the system of scenes that contain the same objects."""
     scene = scenes[0]
     places = CONTACTS_PER_BODY * (len(scene.layout.sides) + scene.layout.num_objects)
     model = _brax_scene(scene, places)

@@ -91,13 +91,7 @@ def make_advance(model: BraxModel, own_slot: Array) -> Advance:
 
 
 def empty_worlds(model: BraxModel, num_envs: int, slots: int) -> Worlds:
-    """Worlds before their first reset: everything zero.
-
-    Args:
-        model: the system.
-        num_envs: worlds N.
-        slots: object slots O of the library.
-    """
+    """Worlds before their first reset: everything zero."""
     system, (hands, _) = model.system, model.link_of_geom.shape
     links = int(model.link_of_geom.max()) + 1
 
@@ -182,12 +176,7 @@ def _substep(
 
 
 def system_of(model: BraxModel, motion: ArrayLike) -> mjx.Model:
-    """The system with the supports of one motion.
-
-    Args:
-        model: the system, and the supports of all motions.
-        motion: motion row, ().
-    """
+    """The system with the supports of one motion."""
     system, ids = model.system, model.support_geoms
     return system.replace(
         geom_pos=system.geom_pos.at[ids].set(model.support_pos[motion]),
@@ -236,12 +225,7 @@ def _contact(model: BraxModel, own_slot: Array, state: State) -> Array:
 
 
 def is_full(model: BraxModel, state: mjx.Data) -> Array:
-    """Whether all places of a contact dimension are taken, so that some may lack.
-
-    Args:
-        model: the system.
-        state: of one world, after collision detection.
-    """
+    """Whether all places of a contact dimension are taken, so that some may lack."""
     contact = state._impl.contact
     touching = contact.dist < contact.includemargin
     full = jnp.zeros((), bool)
@@ -275,21 +259,13 @@ def set_up() -> torch.device:
 
 
 def to_jax(x: Tensor) -> Array:
-    """A private copy of a tensor as a JAX array, 32 bit.
-
-    Args:
-        x: any shape; float64 and int64 become float32 and int32.
-    """
+    """A private copy of a tensor as a JAX array, 32 bit."""
     own = x.detach().to(_NARROW.get(x.dtype, x.dtype), copy=True).contiguous()
     return jax.device_put(jax.dlpack.from_dlpack(own), _target())
 
 
 def to_torch(x: Array) -> Tensor:
-    """A view of a JAX array: read it, never write it, and clone what leaves.
-
-    Args:
-        x: any shape.
-    """
+    """A view of a JAX array: read it, never write it, and clone what leaves."""
     if next(iter(x.devices())).platform not in ("cpu", "gpu"):
         x = jax.device_put(x, jax.devices("cpu")[0])
     return torch.from_dlpack(x)

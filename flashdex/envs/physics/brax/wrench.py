@@ -22,17 +22,8 @@ GRAVITY = 9.81  # m/s2
 class WrenchInputs(NamedTuple):
     """``ObjectWrench`` as arrays; here of one world, batched in front elsewhere.
 
-    Attributes:
-        ref_pose: reference position and quaternion, world, (O, 7).
-        ref_vel: reference linear and angular velocity, world, (O, 6).
-        mass: kg, (O,).
-        inertia: about the centre of mass, object axes, kg m2, (O, 3, 3).
-        present: the slot holds an object, (O,) bool.
-        hold: share of the hold after a reset, 0..1, ().
-        kp: assist stiffness, N/m, ().
-        kv: assist damping, N s/m, ().
-        limits: stiffness of the hold, rad/s; torque ratio, no unit; force limit, N;
-            torque limit, N m, (4,).
+    ``limits`` holds its four numbers: stiffness of the hold, rad/s; torque ratio, no
+    unit; force limit, N; torque limit, N m, (4,).
     """
 
     ref_pose: Array
@@ -49,12 +40,7 @@ class WrenchInputs(NamedTuple):
 def wrench_inputs(
     wrench: ObjectWrench, to_jax: Callable[[Tensor], Array]
 ) -> WrenchInputs:
-    """The arrays of all worlds, (N, ...), but ``limits``, which they share.
-
-    Args:
-        wrench: of all worlds.
-        to_jax: gives a tensor to JAX.
-    """
+    """The arrays of all worlds, (N, ...), but ``limits``, which they share."""
     limits = (
         wrench.hold_stiffness,
         wrench.torque_ratio,

@@ -11,8 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import RawState
-from flashdex.envs.physics.state_map import StateMap
+from flashdex.envs.physics.base import Engine, RawState
 from flashdex.envs.physics.warp.model import (
     WorldRows,
     model_fields,
@@ -21,7 +20,6 @@ from flashdex.envs.physics.warp.model import (
     warp_device,
 )
 from flashdex.envs.physics.warp.wrench import WrenchInput
-from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.scene.union import build_union
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
@@ -98,16 +96,10 @@ def _kinds(overflow: Any) -> dict[str, int]:
     }
 
 
-class WarpPhysics:
+class WarpPhysics(Engine):
     """One model of mujoco_warp whose rows follow each world's motion; see ``Physics``.
 
     It computes in float32 and runs on the first CUDA device, without one on the CPU.
-
-    Args:
-        library: the prepared collection; one scene is compiled for each motion.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-        num_envs: worlds N.
 
     Raises:
         FlashdexError: its packages are missing, or it cannot run this collection.
@@ -121,17 +113,12 @@ class WarpPhysics:
         num_envs: int,
     ) -> None:
         wp = require_warp()[0]
-        self.num_envs = num_envs
-        self.device = warp_device()
-        self.decimation = physics.decimation
-        self.step_dt = physics.timestep * physics.decimation
-        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        super().__init__(library, hands, physics, num_envs, warp_device())
         union = build_union(library, hands, physics, self.scenes, model_fields())
         room = room_of(union.model, physics)
         name = str(wp.device_from_torch(self.device))
         self._rows = WorldRows(union, num_envs, room, name)
         self.model, self.data = self._rows.model, self._rows.data
-        self.map = StateMap(library, hands, self.scenes[0]).to(self.device)
         self._contact_adr = torch.as_tensor(union.contact).to(self.device)
         data = self.data
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
@@ -139,7 +126,6 @@ class WarpPhysics:
         self._sensor = wp.to_torch(data.sensordata)
         self._warmstart = wp.to_torch(data.qacc_warmstart)
         self._overflow = wp.to_torch(data.overflow)
-        self._motion = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self._bad = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self._wrench = WrenchInput(self.data, union.model, self.map, num_envs)
         self._bad_wp = wp.from_torch(self._bad)
@@ -191,18 +177,10 @@ class WarpPhysics:
 
     def state(self) -> TensorDict:
         """Current state in the layout of ``flashdex.keys``; see ``Physics.state``."""
-        pos, vel, pose, object_vel = self.map.read(self._qpos, self._qvel, self._motion)
         adr = self._contact_adr[self._motion]
         sensed = self._sensor.gather(1, adr.flatten(1)).reshape(adr.shape)
-        out = {
-            keys.JOINT_POS: pos,
-            keys.JOINT_VEL: vel,
-            keys.OBJECT_POSE: pose,
-            keys.OBJECT_VEL: object_vel,
-            keys.CONTACT: self.map.read_contact(sensed, self._motion),
-            "bad": self._bad.clone(),
-        }
-        return TensorDict(out, batch_size=[self.num_envs], device=self.device)
+        found = self._state(self._qpos, self._qvel, sensed, self._bad.clone())
+        return found.to(self.device)
 
     def raw(self) -> RawState:
         """Views of the state; see ``Physics.raw``."""

@@ -58,11 +58,6 @@ def measure_warp(
 ) -> WarpMemory:
     """Make the engine's arrays for 2 and for 10 worlds on the CPU and compare.
 
-    Args:
-        library: a collection, or a stand-in of its sizes.
-        hands: hand specs by side.
-        physics: engine settings of the recipe.
-
     Raises:
         MissingExtraError: warp or mujoco_warp is not installed.
     """
@@ -107,12 +102,7 @@ def _step_bytes(rows: WorldRows) -> int:
 
 @contextmanager
 def _dry(wp: Any, made: list[int]) -> Iterator[None]:
-    """Let warp code allocate and compute nothing: no kernel is compiled or launched.
-
-    Args:
-        wp: the warp module.
-        made: receives the bytes of every array that is made inside.
-    """
+    """Let warp code allocate and compute nothing: no kernel is compiled or launched."""
 
     def counted(make: Any) -> Any:
         def call(*args: Any, **options: Any) -> Any:

@@ -62,14 +62,7 @@ def model_fields() -> dict[str, bool]:
 
 
 class WorldRows:
-    """The rows of the model that each world has of its own.
-
-    Args:
-        union: model and rows of the collection.
-        num_envs: worlds N.
-        room: buffer sizes of a world.
-        device: warp's name of the device.
-    """
+    """The rows of the model that each world has of its own."""
 
     def __init__(
         self, union: SceneUnion, num_envs: int, room: Room, device: str
@@ -105,12 +98,7 @@ class WorldRows:
         self._geom_pos = wp.to_torch(self.model.geom_pos)[:num_envs]
 
     def write(self, mask: Tensor, motion: Tensor) -> None:
-        """Give the worlds of ``mask`` the rows of their motions.
-
-        Args:
-            mask: (N,) bool.
-            motion: motion rows of all worlds, (N,).
-        """
+        """Give the worlds of ``mask`` (N,) the rows of their motions, (N,)."""
         for view, table in self._views:
             chosen = mask.reshape(-1, *[1] * (view.ndim - 1))
             view.copy_(torch.where(chosen, table[motion], view))
@@ -159,10 +147,6 @@ def room_of(model: mujoco.MjModel, physics: PhysicsConfig) -> Room:
     Pairs that could touch are far more (1,657 for two hands and two objects of 16
     parts), but few do at a time. Half as many pairs need the convex collider, whose
     scratch memory is the largest of all buffers.
-
-    Args:
-        model: union of the collection.
-        physics: may name contacts and rows.
     """
     body = model.geom_bodyid
     solid = (model.geom_contype | model.geom_conaffinity) != 0

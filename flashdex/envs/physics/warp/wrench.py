@@ -20,14 +20,7 @@ _PARAMS = ("hold_stiffness", "torque_ratio", "force_limit", "torque_limit")
 
 
 class WrenchInput:
-    """Copies of an ``ObjectWrench`` at fixed addresses, and the kernel that reads them.
-
-    Args:
-        data: warp data of the worlds.
-        model: host model, for where the objects are.
-        state_map: layout of the scenes, on the device.
-        num_envs: worlds N.
-    """
+    """Copies of an ``ObjectWrench`` at fixed addresses; a kernel reads them."""
 
     def __init__(
         self, data: Any, model: mujoco.MjModel, state_map: StateMap, num_envs: int
@@ -73,11 +66,7 @@ class WrenchInput:
         ]
 
     def copy(self, wrench: ObjectWrench) -> None:
-        """Take over the numbers of a control step.
-
-        Args:
-            wrench: of this step, on the same device.
-        """
+        """Take over the numbers of a control step."""
         for name, copy in self._copies.items():
             copy.copy_(getattr(wrench, name))
         for i, name in enumerate(_PARAMS):

@@ -8,14 +8,9 @@ import torch
 from benchmarks.common.ceilings import count_products, total_flops
 from flashdex.algorithms.agent import make_actor, make_critic
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.objectives.batch import FlashBatch
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.training.memory_walk import (
-    PeakMeter,
-    flashsac_flops,
-    gradient_bytes,
-    make_flash_batch,
-    walk_flashsac,
-)
+from flashdex.training.rehearsal import Networks, PeakMeter, flashsac_update
 
 FUTURE = (12, 10)
 SMALL = {"actor_width": 32, "critic_width": 48, "future_channels": [16, 16, 8]}
@@ -30,9 +25,21 @@ def make_loss(device, **values):
 
 
 def make_batch(loss, size, device):
-    return make_flash_batch(
-        loss, size=size, observation=90, future=FUTURE, device=device
-    )
+    with torch.device(device):
+        batch = FlashBatch(
+            observation=torch.randn(2 * size, 90),
+            future=torch.randn(2 * size, *FUTURE[::-1]).mT,
+            action=torch.rand(size, 14),
+            reward=torch.randn(2, size),
+            discount=torch.ones(size),
+            terminated=torch.zeros(size),
+            weight=torch.ones(2, size),
+        )
+        return batch, torch.randn(2, size, 7)
+
+
+def walk_flashsac(loss, batch, noise, **options):
+    return flashsac_update(loss, batch, noise, **options)[0]
 
 
 def test_meter_counts_storages_not_views():
@@ -108,12 +115,12 @@ def test_gradients_are_not_counted_twice():
     # Of two rows the activations are nothing beside the weights. The actor's step holds
     # one copy of the critic's weights, with frozen statistics folded in; the critic's a
     # quarter (one layer on its way) on top of the gradients.
-    assert walked < 1.05 * gradient_bytes(loss.qvalue_network)
+    assert walked < 1.05 * Networks.of(loss.qvalue_network).gradients
 
 
 @pytest.mark.parametrize("period", [1, 2])
 def test_products_are_those_the_profiler_sees(period):
-    walked = flashsac_flops(
+    _, walked = flashsac_update(
         make_loss("meta"),
         *make_batch(make_loss("meta"), 64, "meta"),
         actor_period=period,

@@ -16,7 +16,7 @@ from benchmarks.common.output import add_output_options, emit
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.build import Workbench, open_workbench
+from flashdex.training.build import RunBuilder
 
 
 def main(words: list[str] | None = None) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def main(words: list[str] | None = None) -> dict[str, Any]:
     """
     args = _parse(words or [])
     recipe = compose_bench(args, where="benchmarks.env")
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     begin = time.perf_counter()
     env = bench.make_env()
     made = time.perf_counter() - begin
@@ -57,7 +57,7 @@ def _measure(env: TrackingEnv, recipe: Recipe, *, seconds: float) -> dict[str, A
     return turns.measure(env, seconds=seconds)
 
 
-def describe_bench(bench: Workbench, env: TrackingEnv) -> dict[str, Any]:
+def describe_bench(bench: RunBuilder, env: TrackingEnv) -> dict[str, Any]:
     """What was measured: recipe, engine, device, worlds and scene.
 
     Args:

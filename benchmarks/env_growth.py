@@ -22,7 +22,7 @@ from benchmarks.common.output import add_output_options, emit
 from benchmarks.common.turns import TurnTaker
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.build import open_workbench
+from flashdex.training.build import RunBuilder
 
 STEPS = 8  # control steps of a turn
 # objects, hulls, worlds; the first one is what the others are compared with
@@ -38,7 +38,7 @@ def make_env(
     changes = [f"motions.library={library}", "motions.count=null"]
     changes += [f"env.num_envs={worlds}", "physics.num_threads=1", *args.overrides]
     recipe = expect_kind(compose(args.recipe, changes), Recipe, where="env_growth")
-    return open_workbench(recipe).make_env()
+    return RunBuilder.from_recipe(recipe).make_env()
 
 
 def measure(takers: list[TurnTaker], *, rounds: int) -> dict[str, list[list[float]]]:

@@ -25,7 +25,7 @@ from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
 from flashdex.replay.codec import row_bytes
-from flashdex.training.build import learner_device, open_workbench
+from flashdex.training.build import RunBuilder, learner_device
 
 SOURCE_WORLDS = 64  # of the environment whose rows are copied into the ring
 SOURCE_STEPS = 24
@@ -73,7 +73,7 @@ def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
     Raises:
         FlashdexError: the rows do not fit into memory.
     """
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     learner = bench.make_learner(env := bench.make_env())
     assert isinstance(learner, FlashSACLearner)
     device, rows = learner_device(recipe), recipe.algo.buffer_size
@@ -172,7 +172,7 @@ def _make_block(
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
     rows = rows[chosen]
-    codec = learner.codec
+    codec = learner.rows.codec
     pack = seconds_each(lambda: codec.pack(rows), learner.device, seconds=seconds)
     return codec.pack(rows), pack
 

@@ -12,7 +12,7 @@ from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
-from flashdex.training.build import open_workbench
+from flashdex.training.build import RunBuilder
 
 ROWS_PER_BATCH = 8  # replay rows collected before measuring, in batches
 BURN_IN = 4
@@ -35,7 +35,7 @@ def measure_recipe(
     """
     changed = ["algo.actor_delay=0", *overrides]
     recipe = expect_kind(compose(name, changed), Recipe, where="benchmarks.learner")
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     env = bench.make_env()
     learner = bench.make_learner(env)
     assert isinstance(learner, FlashSACLearner)
@@ -69,7 +69,7 @@ def _collect(env: TrackingEnv, learner: FlashSACLearner, *, rows: int) -> None:
         after = td.get("next")
         reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
         terminated, done = after[keys.TERMINATED], after[keys.DONE]
-        learner.remember(td, action, reward, after, terminated, done)
+        learner.process_step(td, action, reward, after, terminated, done)
         td = following
 
 
@@ -82,9 +82,9 @@ def _one_update(learner: FlashSACLearner) -> dict[str, float]:
         call()
         times[phase] = time.perf_counter() - start
 
-    state, _ = learner.codec.unpack(learner.buffer.draw())
-    clock("sample", lambda: learner.codec.unpack(learner.buffer.draw()))
-    clock("assemble", lambda: learner.show_rows(state))
+    state, _ = learner.rows.codec.unpack(learner.buffer.draw())
+    clock("sample", lambda: learner.rows.codec.unpack(learner.buffer.draw()))
+    clock("assemble", lambda: learner.rows.assemble_rows(state))
     clock("whole", learner.update)
     times["learn"] = times["whole"] - times["sample"] - times["assemble"]
     return times

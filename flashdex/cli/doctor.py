@@ -78,6 +78,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     Raises:
         FlashdexError: the recipe has mistakes or trains no motions.
     """
+    from flashdex.algorithms import find_algorithm
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.build import learner_device
     from flashdex.training.memory import plan_memory
@@ -93,7 +94,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
         recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
     )
     parts = [format_plan(plan)]
-    if recipe.algo.kind == "flashsac":
+    if find_algorithm(recipe.algo.kind).has_replay:
         parts += [format_cards(plan)] * on_gpu + [format_work(plan)]
     return "\n\n".join(parts), plan.fits and not (on_gpu and plan.machine.gpu is None)
 

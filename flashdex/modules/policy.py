@@ -29,7 +29,7 @@ class FlashPolicy(TensorDictModuleBase):
         observation: key of the observation, (N, D).
         future: key of the future window, (N, C, K), read if the actor has an encoder.
         action: name of the action inside its group.
-        quiet: key of a flag (N, 1); where it is true, actions are deterministic even
+        deterministic_key: key of a flag (N, 1); where it is true, actions are deterministic even
             under RANDOM. None: no such flag.
     """
 
@@ -42,10 +42,10 @@ class FlashPolicy(TensorDictModuleBase):
         observation: NestedKey = "observation",
         future: NestedKey = "future",
         action: str = "action",
-        quiet: NestedKey | None = None,
+        deterministic_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
-        self.quiet = quiet
+        self.deterministic_key = deterministic_key
         self.actor = actor
         self.noise = NoiseRepetition() if noise is None else noise
         self.has_future = actor.future_encoder is not None
@@ -65,8 +65,9 @@ class FlashPolicy(TensorDictModuleBase):
         mean, std = self.actor(*inputs, mode="eval")
         if exploration_type() == ExplorationType.RANDOM:
             noise = self.noise(tuple(mean.shape)).to(mean.dtype)
-            if self.quiet is not None:
-                noise = noise.masked_fill(tensordict.get(self.quiet).reshape(-1, 1), 0)
+            if self.deterministic_key is not None:
+                flag = tensordict.get(self.deterministic_key)
+                noise = noise.masked_fill(flag.reshape(-1, 1), 0)
             mean = mean + std * noise
         action = torch.tanh(mean)
         for key, value in zip(self.out_keys, action.unbind(0), strict=True):

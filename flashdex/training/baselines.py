@@ -13,10 +13,10 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.criteria import criterion_names, score
-from flashdex.metrics.errors import frozen_object
+from flashdex.metrics.errors import Signals, frozen_object
 from flashdex.rollouts.build import grace_steps
 from flashdex.system.files import write_atomic
-from flashdex.training.build import Workbench
+from flashdex.training.build import RunBuilder
 from flashdex.training.evaluator import roll_all
 
 
@@ -55,42 +55,33 @@ def follow_reference(env: TrackingEnv) -> Tensor:
 BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}
 
 
-def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
+def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
     """Roll and score all baselines on all motions; reuse the file of this run.
 
     Args:
-        bench: motions and recipe.
+        builder: motions and recipe.
         path: JSON file that keeps the result.
     """
     if path is not None and path.is_file():
         return Baselines(json.loads(path.read_text(encoding="utf-8")))
-    joints = bench.bank.num_joints
+    joints = builder.bank.num_joints
 
     def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
         return torch.zeros(env.num_envs, 2, joints, device=env.device)
 
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     for name, target in BASELINES.items():
-        criterion = bench.recipe.train.criterion
-        rows[name] = {}
-        for attempt in roll_all(bench, idle, target=target):
-            verdicts = score(attempt.rollout.signals(), grace=attempt.rollout.grace)
-            verdict = verdicts[criterion]
-            rows[name][attempt.rollout.motion] = {
-                "passed": [k for k, v in verdicts.items() if v.is_passed],
-                "state": verdict.state,
-                "errors": {k: round(v, 5) for k, v in verdict.values.items()},
-            }
-    rows["frozen_object"] = _score_frozen(bench)
+        rollouts = [a.rollout for a in roll_all(builder, idle, target=target)]
+        rows[name] = {r.motion: _row(builder, r.signals(), r.grace) for r in rollouts}
+    rows["frozen_object"] = _score_frozen(builder)
     if path is not None:
         write_atomic(path, json.dumps(rows, indent=1))
     return Baselines(rows)
 
 
-def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
+def _score_frozen(builder: RunBuilder) -> dict[str, dict[str, Any]]:
     """``frozen_object``: objects stay at their first reference pose."""
-    bank = bench.bank_on(torch.device("cpu"))
-    criterion = bench.recipe.train.criterion
+    bank = builder.bank_on(torch.device("cpu"))
     out: dict[str, dict[str, Any]] = {}
     for row, name in enumerate(bank.names):
         frames = torch.arange(int(bank.length[row]))
@@ -103,14 +94,19 @@ def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
             hand_object=slots.tolist(),
             fps=bank.fps,
         )
-        verdicts = score(signals, grace=grace_steps(bank.fps))
-        verdict = verdicts[criterion]
-        out[name] = {
-            "passed": [k for k, v in verdicts.items() if v.is_passed],
-            "state": verdict.state,
-            "errors": {k: round(v, 5) for k, v in verdict.values.items()},
-        }
+        out[name] = _row(builder, signals, grace_steps(bank.fps))
     return out
+
+
+def _row(builder: RunBuilder, signals: Signals, grace: int) -> dict[str, Any]:
+    """Scores of one motion."""
+    verdicts = score(signals, grace=grace)
+    verdict = verdicts[builder.recipe.train.criterion]
+    return {
+        "passed": [k for k, v in verdicts.items() if v.is_passed],
+        "state": verdict.state,
+        "errors": {k: round(v, 5) for k, v in verdict.values.items()},
+    }
 
 
 def format_baselines(baselines: Baselines) -> str:

@@ -10,9 +10,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from flashdex import keys
-from flashdex.algorithms.agent import make_actor, make_critic, make_encoder
 from flashdex.algorithms.config import AlgoConfig
-from flashdex.algorithms.hand_groups import HandGroups
+from flashdex.algorithms.flashsac import make_actor, make_critic
+from flashdex.algorithms.inputs import HandGroups, make_encoder
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.tracking import state_spec

@@ -1,27 +1,33 @@
-"""Sessions of a run: what a crash cost, and that its time is counted all the same."""
+"""Sessions of a run: where one begins, what a crash cost, and what ends one."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+import signal
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from omegaconf import OmegaConf
 
+from flashdex.algorithms import find_algorithm
 from flashdex.errors import RunError
 from flashdex.recipe import RunRecipe
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.training.logging import METRICS
 
+_LOG = logging.getLogger(__name__)
 SESSIONS = "sessions.jsonl"
+LABELS = ("name", "ablation", "seed", "run_dir")  # of the records so far
 SIGNAL = "signal"  # why a session ended, when a person or a scheduler ended it
 
 
 @dataclass(frozen=True)
-class Start:
+class SessionStart:
     """Where a session begins.
 
     Attributes:
@@ -37,7 +43,7 @@ class Start:
 
 def begin_session(
     run_dir: Path, *, env_steps: int, wall_s: float, overrides: list[str]
-) -> Start:
+) -> SessionStart:
     """Work out where a session begins and write its ``start`` line.
 
     The counters go back to the checkpoint. The clock does not: it goes on from the
@@ -57,7 +63,7 @@ def begin_session(
     # What an earlier resume has counted already was written before that resume.
     reached = [steps for steps, wall in seen if wall > since]
     lost = max(0, max(reached, default=0) - env_steps)
-    start = Start(
+    start = SessionStart(
         env_steps=env_steps,
         wall_s=max([wall_s, since, *(wall for _, wall in seen)]),
         lost=lost + (before[-1]["env_steps_lost"] if before else 0),
@@ -113,19 +119,6 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-# What the records so far were made with, and what the networks and reward statistics
-# of either algorithm mean.
-LABELS = ("name", "ablation", "seed", "run_dir")
-FIXED = (*LABELS, "algo.kind", "algo.groups", "algo.v_max")
-FIXED_FLASHSAC = (
-    *FIXED,
-    "algo.head",
-    "algo.critic_action",
-    "algo.num_atoms",
-    "algo.noise_clock",
-)
-
-
 def stored_value(text: str, key: str) -> Any:
     """Value of a recipe as it was composed, None where it has no such key.
 
@@ -152,9 +145,9 @@ def refuse_changes(text: str, recipe: RunRecipe) -> None:
     """
     stored = OmegaConf.create(text)
     present = OmegaConf.create(dataclasses.asdict(recipe))
-    flashsac = OmegaConf.select(stored, "algo.kind") == "flashsac"
+    algorithm = find_algorithm(OmegaConf.select(stored, "algo.kind"))
     changed = []
-    for key in FIXED_FLASHSAC if flashsac else FIXED:
+    for key in (*LABELS, *algorithm.immutable_keys):
         was, now = OmegaConf.select(stored, key), OmegaConf.select(present, key)
         if was != now:
             changed.append(f"{key} from {was} to {now}")
@@ -163,3 +156,43 @@ def refuse_changes(text: str, recipe: RunRecipe) -> None:
             f"these cannot change in a running run: {', '.join(changed)}; start a new "
             "run"
         )
+
+
+class StopSignals:
+    """Notes Ctrl-C, SIGTERM and a closed terminal, for the loop to act on.
+
+    A second Ctrl-C raises KeyboardInterrupt where it falls. A second SIGTERM does
+    nothing: schedulers repeat it, and it must not cost the checkpoint being written.
+
+    Attributes:
+        requested: whether to stop.
+
+    Example:
+        >>> with StopSignals() as stop:
+        ...     stop.requested
+        False
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        names = [signal.SIGINT, signal.SIGTERM]
+        hangup = getattr(signal, "SIGHUP", None)
+        # nohup ignores it, and is taken at its word
+        if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
+            names.append(hangup)
+        self._before = {n: signal.signal(n, self._note) for n in names}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for name, handler in self._before.items():
+            signal.signal(name, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if not self.requested:
+            _LOG.info("stopping after this step; Ctrl-C again stops at once")
+        self.requested = True

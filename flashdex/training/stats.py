@@ -70,7 +70,6 @@ class RunningStats:
             done: (N, 1) bool.
             terminated: (N, 1) bool.
         """
-        self._steps += 1
         values = {f"reward/{{side}}/{k}": v for k, v in outcome.terms.items()}
         values["reward/{side}/total"] = outcome.reward
         values["error/{side}/object_pos_mm"] = outcome.object_pos_error * 1e3
@@ -87,13 +86,14 @@ class RunningStats:
     def add_ends(
         self, done: Tensor, terminated: Tensor, causes: dict[str, Tensor] | None = None
     ) -> None:
-        """Count the episodes that ended.
+        """Count one vector step and the episodes that ended in it.
 
         Args:
             done: (N, 1) bool.
             terminated: (N, 1) bool.
             causes: for what; (N, 2) bool each, by hand.
         """
+        self._steps += 1
         causes = causes or {}
         ends = [done.sum(), terminated.sum()]
         ends += [cause.any(-1).sum() for cause in causes.values()]
@@ -132,36 +132,3 @@ class RunningStats:
             out[f"perf/ms_{phase}"] = 1e3 * spent / max(self._calls[phase], 1)
         self._clear()
         return out
-
-
-class GymStats(RunningStats):
-    """Adds returns and lengths of finished training episodes.
-
-    Args:
-        num_envs: worlds N.
-    """
-
-    def __init__(self, num_envs: int) -> None:
-        super().__init__()
-        self._returns = torch.zeros(num_envs, 1, dtype=torch.float64)
-        self._lengths = torch.zeros(num_envs, 1, dtype=torch.int64)
-
-    def add_rewards(self, reward: Tensor, terminated: Tensor, done: Tensor) -> None:
-        """Take in one vector step.
-
-        Args:
-            reward: raw, (N, 1); those not finite count as 0.
-            terminated: (N, 1) bool.
-            done: terminated or truncated, (N, 1) bool.
-        """
-        self._steps += 1
-        self._returns += torch.where(reward.isfinite(), reward, 0.0)
-        self._lengths += 1
-        self.add_ends(done, terminated)
-        if not done.any():
-            return
-        finished = {"episode/return": self._returns, "episode/length": self._lengths}
-        sums = [value[done].double().sum() for value in finished.values()]
-        self.add(list(finished), torch.stack(sums), done.sum())
-        for value in finished.values():
-            value[done] = 0

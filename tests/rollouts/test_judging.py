@@ -19,7 +19,7 @@ from flashdex.rollouts.recorder import AttemptRing
 from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder
 from flashdex.system.jsonl import read_lines
 from flashdex.system.machine import versions
-from flashdex.training.assemble import start_judge
+from flashdex.training.tracking import start_judge
 
 
 def die(order):

@@ -14,8 +14,8 @@ from gym_runs import read_metrics, tiny_recipe, trainer_of
 from flashdex.cli.main import main
 from flashdex.errors import FlashdexError, RunError
 from flashdex.training.checkpoint import newest_checkpoint
-from flashdex.training.evaluator import SEED_OFFSET
-from flashdex.training.gym_run import resume_gym, train_gym
+from flashdex.training.gym import SEED_OFFSET
+from flashdex.training.run_dir import resume, train
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 
@@ -170,10 +170,10 @@ def test_a_checkpoint_that_cannot_be_written_does_not_end_the_run(
 
 
 def test_a_finished_run_does_nothing_when_resumed(make_recipe):
-    folder = train_gym(make_recipe())
+    folder = train(make_recipe())
     wanted = ["metrics.jsonl", f"checkpoints/{120:012d}.pt"]
     before = [(folder / name).read_bytes() for name in wanted]
-    resume_gym(folder)
+    resume(folder)
     assert [(folder / name).read_bytes() for name in wanted] == before
     assert newest_checkpoint(folder) == f"checkpoints/{120:012d}.pt"
 
@@ -210,11 +210,11 @@ def test_environments_that_cannot_be_used_exit_two(env_id, expected, tmp_path, c
 def test_the_missing_package_is_named_with_its_extra(monkeypatch, make_recipe):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(FlashdexError, match=r"pip install '\.\[gym\]'"):
-        train_gym(make_recipe())
+        train(make_recipe())
 
 
 def test_changed_networks_do_not_resume(make_recipe, capsys):
-    folder = train_gym(make_recipe())
+    folder = train(make_recipe())
     before = (folder / "recipe.yaml").read_text()
     words = [str(folder), "algo.critic_width=24"]
     for verb in (["train", "total_env_steps=200", "--resume"], ["evaluate"]):

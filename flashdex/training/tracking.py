@@ -1,0 +1,312 @@
+"""Following motions as a task: attempts are recorded, judged and stored in a ledger."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import logging
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from flashdex import keys
+from flashdex.algorithms.base import Learner
+from flashdex.envs.mdp.assist import AssistEpoch
+from flashdex.envs.scene.scene import build_scenes
+from flashdex.envs.tracking import TrackingEnv
+from flashdex.errors import RunError
+from flashdex.modules.layers import restore_generator
+from flashdex.recipe import Recipe, RunRecipe, dump_recipe, expect_kind
+from flashdex.replay.buffer import check_pinning
+from flashdex.rollouts.build import AttemptMaker
+from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.recorder import AttemptRing, Episode
+from flashdex.rollouts.scorer import JudgeBeside, JudgeHere, JudgeOrder, Judging
+from flashdex.system.machine import versions
+from flashdex.training.baselines import score_baselines
+from flashdex.training.build import RunBuilder, learner_device
+from flashdex.training.checkpoint import EVALUATED, RESUMED
+from flashdex.training.evaluator import evaluate_motions
+from flashdex.training.memory import check_memory
+from flashdex.training.memory_library import find_library
+from flashdex.training.session import SessionStart
+
+if TYPE_CHECKING:
+    from flashdex.training.trainer import Trainer
+
+_LOG = logging.getLogger(__name__)
+BASELINES = "baselines.json"
+_ROOM = {"contacts": "physics.nconmax", "constraints": "physics.njmax"}
+
+
+class TrackingTask:
+    """See `flashdex.training.trainer.Task`.
+
+    Args:
+        builder: motions and recipe.
+    """
+
+    worlds_key = "env.num_envs"
+    evaluated_keys, resumed_keys = EVALUATED, RESUMED
+    updates_during_step = True
+    record_due = False
+
+    def __init__(self, builder: RunBuilder) -> None:
+        self.builder, self.recipe = builder, builder.recipe
+        self.make_env, self.make_learner = builder.make_env, builder.make_learner
+        self.assist_epoch = AssistEpoch()
+
+    @classmethod
+    def open(cls, recipe: RunRecipe, run_dir: Path) -> TrackingTask:
+        """Prepare the motions of a recipe; refuse what cannot fit into memory."""
+        recipe = expect_kind(recipe, Recipe, where=str(run_dir))
+        device = learner_device(recipe)
+        if recipe.algo.replay == "pinned":
+            check_pinning(device)
+        if find_library(recipe) is None:
+            check_memory(recipe, run_dir=run_dir)  # before what may be hours
+        builder = RunBuilder.from_recipe(recipe)
+        _LOG.info("%s", check_memory(recipe, library=builder.library, run_dir=run_dir))
+        return cls(builder)
+
+    @classmethod
+    def open_to_evaluate(cls, recipe: RunRecipe) -> TrackingTask:
+        """Prepare the motions of a recipe."""
+        recipe = expect_kind(recipe, Recipe, where="evaluate")
+        return cls(RunBuilder.from_recipe(recipe))
+
+    @cached_property
+    def provenance(self) -> dict[str, str]:
+        """Where a rollout comes from, apart from the versions stored with it."""
+        manifest = (self.builder.library.path / "manifest.json").read_bytes()
+        recipe = dump_recipe(self.recipe).encode()
+        return {
+            "recipe_sha256": hashlib.sha256(recipe).hexdigest(),
+            "library_sha256": hashlib.sha256(manifest).hexdigest(),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+
+    @property
+    def rows_meaning(self) -> str:
+        """What replay rows depend on, hashed."""
+        recipe = self.recipe
+        rows = {
+            "library": self.provenance["library_sha256"],
+            "motions": self.builder.bank.names,
+            "env": dataclasses.asdict(recipe.env),
+            "physics": dataclasses.asdict(recipe.physics),
+            "return": [recipe.algo.n_step, recipe.algo.gamma],
+        }
+        text = json.dumps(rows, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
+        """Score the baselines and open the ledger.
+
+        Args:
+            run_dir: run directory, locked.
+            env: of the run.
+            changed: the recipe is another one now; its baselines are, too.
+        """
+        self.env, self.run_dir = env, run_dir
+        if changed:
+            (run_dir / BASELINES).unlink(missing_ok=True)
+        baselines = score_baselines(self.builder, run_dir / BASELINES)
+        self.ledger = open_ledger(
+            self.builder,
+            run_dir,
+            baselines.trivial(self.recipe.train.criterion),
+            on_gpu=env.device.type == "cuda",
+        )
+
+    def begin(self, start: SessionStart, state: dict[str, Any] | None) -> None:
+        """Take in what a crash left in the ledger, and open recorder and judge."""
+        ledger = self.ledger
+        if state is not None and ledger.num_bytes < state["ledger_bytes"]:
+            _LOG.warning(
+                "%s is shorter than at the checkpoint: attempts are missing",
+                ledger.path,
+            )
+        for name in ledger.adopt(wall_s=start.wall_s):
+            _LOG.info("%s: its stored rollout had no line yet, and has one now", name)
+        for name in ledger.conversions:
+            self._mark_converted(name)
+        self.judging: Judging = self._open_judging()
+        self.recorder = AttemptRing(self.env)
+
+    def _open_judging(self) -> Judging:
+        """In the loop, or in a process where the physics would wait for it."""
+        recipe, env = self.recipe, self.env
+        made_by = versions(recipe.physics.engine, env.device)
+        where = recipe.train.judge
+        if where == "inline" or (where == "auto" and env.host_sees):
+            maker = self.builder.attempt_maker(
+                env.physics.scenes, made_by=made_by, provenance=self.provenance
+            )
+            return JudgeHere(self.ledger, maker)
+        # The process must not prepare the motions again: name the library in use.
+        library = str(self.builder.library.path)
+        motions = dataclasses.replace(recipe.motions, library=library)
+        order = JudgeOrder(
+            dataclasses.replace(recipe, motions=motions),
+            self.run_dir,
+            made_by,
+            self.provenance,
+            self.ledger.trivial,
+            self.ledger.on_gpu,
+        )
+        return JudgeBeside(self.ledger, order, start_judge)
+
+    def after_reset(self) -> None:
+        """Keep the state that the coming step starts from."""
+        self.recorder.begin()
+
+    def after_physics(self, trainer: Trainer, action: Tensor, done: Tensor) -> None:
+        """Record the step and judge what has ended; the learner may be at work."""
+        with trainer.stats.time("judge"):
+            episodes = self.recorder.step(action, done, trainer.env_steps)
+            self._judge(episodes, trainer.wall_s)
+
+    def after_step(self, trainer: Trainer, after: TensorDictBase) -> None:
+        """Count rewards, errors and ends; let the assist fade."""
+        judged = self.env.last_outcome, after[keys.DONE], after[keys.TERMINATED]
+        trainer.stats.add_step(*judged)
+        self.assist_epoch.step(self.env, *judged, trainer.vector_steps)
+
+    def rewards(self, after: TensorDictBase) -> Tensor:
+        """Rewards of both hands, (N, 2)."""
+        return torch.cat([after[keys.reward(side)] for side in keys.SIDES], -1)
+
+    def _judge(
+        self, episodes: list[Episode], wall_s: float, *, wait: bool = False
+    ) -> None:
+        for episode in episodes:
+            self.judging.submit(episode, wall_s)
+        for conversion in self.judging.collect(wait=wait):
+            self._mark_converted(conversion.motion)
+
+    def _mark_converted(self, name: str) -> None:
+        row = self.env.bank.names.index(name)
+        self.env.sampler.mark_converted(row)
+        self.env.attempt_sampler.mark_converted(row)
+
+    def settle(self, trainer: Trainer) -> RunError | None:
+        """Judge all attempts so far; what was learnt is not lost with the judge."""
+        try:
+            self._judge(self.recorder.look(), trainer.wall_s, wait=True)
+        except RunError as error:
+            return error
+        return None
+
+    def end_reason(self) -> str:
+        """``all converted``, when that ends the run."""
+        everything = self.ledger.num_converted == len(self.ledger.names)
+        stops = self.recipe.train.stop_when_all_converted
+        return "all converted" if stops and everything else ""
+
+    def finish(self, trainer: Trainer, why: str) -> None:
+        """Nothing: attempts are judged as they come."""
+
+    @property
+    def note(self) -> str:
+        """What was achieved, in a few words."""
+        return self.ledger.note
+
+    @property
+    def num_results(self) -> int:
+        """Attempts judged so far."""
+        return self.ledger.num_attempts
+
+    def metrics(self, trainer: Trainer) -> dict[str, float]:
+        """Conversions and assist; the engine's overflow is read and cleared."""
+        assist, physics = self.env.assist, self.env.physics
+        record = {
+            **self.ledger.metrics(trainer.wall_s / 3600),
+            "convert/pending": float(self.judging.pending),
+            "assist/level": assist.upper[0] if assist is not None else 0.0,
+        }
+        for kind, worlds in physics.take_overflow().items():
+            record[f"physics/overflow_{kind}"] = worlds
+            _LOG.warning(
+                "%d of %d worlds ran out of room for %s: the engine dropped some, so "
+                "these worlds were wrong for a while%s",
+                worlds,
+                self.env.num_envs,
+                kind,
+                f". Raise {_ROOM[kind]}" if kind in _ROOM else "",
+            )
+        return record
+
+    def state_dict(self) -> dict[str, Any]:
+        """Assist, resets and the length of the ledger, its attempts all judged.
+
+        The samplers hold nothing but what the conversions say, and those are in files.
+        """
+        assist = self.env.assist
+        return {
+            "assist": None if assist is None else assist.state_dict(),
+            "assist_epoch": self.assist_epoch.state_dict(),
+            "env_generator": self.env.generator.get_state(),
+            "ledger_bytes": self.ledger.num_bytes,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore ``state_dict``."""
+        self.assist_epoch.load_state_dict(state["assist_epoch"])
+        if self.env.assist is not None and state["assist"] is not None:
+            self.env.assist.load_state_dict(state["assist"])
+            self.env.redraw_assist()
+        restore_generator(self.env.generator, state["env_generator"])
+
+    def evaluate(self, learner: Learner, env_steps: int) -> dict[str, Any]:
+        """See `flashdex.training.evaluator.evaluate_motions`."""
+        return evaluate_motions(self.builder, learner, env_steps=env_steps)
+
+    def close(self, *, wait: bool) -> None:
+        """End the judge; ``wait`` judges what is in line first."""
+        self.judging.close(wait=wait)
+
+
+def open_ledger(
+    builder: RunBuilder, run_dir: Path, trivial: dict[str, list[str]], *, on_gpu: bool
+) -> Ledger:
+    """The ledger of a run directory.
+
+    Args:
+        builder: motions and recipe.
+        run_dir: run directory.
+        trivial: motions that a baseline already passes, and which ones do.
+        on_gpu: a GPU steps the physics.
+    """
+    recipe = builder.recipe
+    return Ledger(
+        run_dir,
+        builder.bank.names,
+        criterion=recipe.train.criterion,
+        seed=recipe.seed,
+        engine=recipe.physics.engine,
+        on_gpu=on_gpu,
+        certify=recipe.train.certify,
+        trivial=trivial,
+    )
+
+
+def start_judge(order: JudgeOrder) -> tuple[Ledger, AttemptMaker]:
+    """Build ledger and maker in the judging process.
+
+    Args:
+        order: what the run told it.
+    """
+    builder = RunBuilder.from_recipe(order.recipe, device=torch.device("cpu"))
+    scenes = build_scenes(builder.library, builder.hands, order.recipe.physics)
+    maker = builder.attempt_maker(
+        scenes, made_by=order.made_by, provenance=order.provenance
+    )
+    ledger = open_ledger(builder, order.run_dir, order.trivial, on_gpu=order.on_gpu)
+    return ledger, maker

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torchrl.envs.transforms import Transform
 
     from flashdex.envs.reference import ReferenceBank
-    from flashdex.replay.buffer import RowBuffer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,25 +44,20 @@ class TaskSpec:
 
 
 class Learner(ABC):
-    """An algorithm: acts, stores what comes of it, and learns.
+    """An algorithm: acts, stores what comes of it, and learns; knows no simulator.
 
-    It knows states and actions, but no simulator. Actions, rewards and flags are
-    (N, 2, J), (N, 2) and (N, 1) where two hands act, and (N, A), (N, 1) and (N, 1) on
-    stock environments.
-
-    Args:
-        config: algorithm part of the recipe.
-        spec: the task it is built for.
+    Actions, rewards and flags are (N, 2, J), (N, 2) and (N, 1) where two hands act, and
+    (N, A), (N, 1) and (N, 1) on stock environments.
 
     Attributes:
         config_class: schema of the algorithm's part of a recipe.
         tasks: kinds of recipes that it can train.
         immutable_keys: recipe keys that give networks and statistics their meaning,
             which a running run may not change.
-        has_replay: it learns from a replay buffer of ``config.buffer_size`` rows.
+        has_replay: it learns from a buffer of ``config.buffer_size`` rows.
         is_off_policy: it may learn between acting and storing the outcome; an
             on-policy learner must not change before the rollout is complete.
-        buffer: its replay buffer, None without one.
+        buffer: its replay buffer, a `RowBuffer`; None without one.
         last_update: what the last update was fed with, if that is kept; see ``redo``.
     """
 
@@ -77,7 +71,7 @@ class Learner(ABC):
     has_replay: ClassVar[bool] = False
     is_off_policy: ClassVar[bool] = False
     device: torch.device
-    buffer: RowBuffer | None = None
+    buffer: Any = None
     last_update: dict[str, Any] | None = None
 
     @abstractmethod
@@ -100,10 +94,10 @@ class Learner(ABC):
 
     @abstractmethod
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
-        """Actions; attempt worlds act deterministically.
+        """Actions in states, batch (N,); attempt worlds act deterministically.
 
         Args:
-            state: batch (N,); of two hands compact, with the ``attempt`` flag.
+            state: of two hands compact, with the ``attempt`` flag.
             explore: False makes every world deterministic.
         """
 
@@ -117,16 +111,7 @@ class Learner(ABC):
         terminated: Tensor,
         done: Tensor,
     ) -> None:
-        """Take in one vector step.
-
-        Args:
-            state: before the step, batch (N,).
-            action: what ``act`` returned.
-            reward: of each hand.
-            next_state: after the step, before any reset.
-            terminated: true failure, bool.
-            done: failure or truncation, bool.
-        """
+        """Take in one vector step; ``next_state`` is that before any reset."""
 
     @abstractmethod
     def num_updates(self) -> int:
@@ -136,6 +121,18 @@ class Learner(ABC):
     def update(self) -> TensorDict:
         """One update; returns its metrics, with the same keys every time."""
 
+    def redo(self, update: dict[str, Any]) -> TensorDict:
+        """Perform an update again on the batch and with the draws of ``last_update``.
+
+        Raises:
+            NotImplementedError: the learner keeps none.
+        """
+        raise NotImplementedError
+
+    @abstractmethod
+    def forget_episodes(self) -> None:
+        """Drop what belongs to unfinished episodes: after a resume they are gone."""
+
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """A copy of all that an exact continuation needs, tensors and plain values."""
@@ -144,32 +141,18 @@ class Learner(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict``."""
 
-    def forget_episodes(self) -> None:
-        """Drop what belongs to unfinished episodes: after a resume they are gone."""
-
     def metrics(self) -> dict[str, float]:
-        """What else a log record of a stock environment says of the learner."""
+        """What a record of a stock environment says of the learner."""
         return {}
 
-    def redo(self, update: dict[str, Any]) -> TensorDict:
-        """Perform an update again on the batch and with the draws it had.
-
-        Args:
-            update: ``last_update`` of the learner that performed it.
-        """
-        raise NotImplementedError
-
     @classmethod
-    def conflicts(
-        cls, config: Any, *, total_env_steps: int, num_envs: int, worlds_key: str
-    ) -> list[str]:
+    def conflicts(cls, config: Any, budget: int, worlds: dict[str, int]) -> list[str]:
         """One line for each thing in a recipe that does not fit together.
 
         Args:
             config: algorithm part of the recipe.
-            total_env_steps: budget.
-            num_envs: worlds.
-            worlds_key: recipe key that gives the worlds, for the message.
+            budget: env steps of the run.
+            worlds: their number, by the recipe key that gives it.
         """
         problems = []
         if config.lr_final > config.lr:
@@ -189,26 +172,23 @@ class Learner(ABC):
         return f"algo.lr={config.lr / 2:g} algo.lr_final={config.lr_final / 2:g}"
 
     @classmethod
-    def row_count(cls, config: Any, *, num_envs: int) -> int:
+    def row_count(cls, config: Any, num_envs: int) -> int:
         """Transitions it keeps at most: those of the buffer or of a rollout."""
         return config.buffer_size
 
     @classmethod
-    def batch_rows(cls, config: Any, *, num_envs: int) -> int:
+    def batch_rows(cls, config: Any, num_envs: int) -> int:
         """Transitions that one gradient step reads."""
         return config.batch_size
 
 
 ALGORITHMS: dict[str, type[Learner]] = {}
-"""By ``algo.kind``; `flashdex.algorithms.known_algorithms` has the built-in ones too."""
+"""Those registered so far; `flashdex.algorithms.known_algorithms` loads ours, too."""
 L = TypeVar("L", bound=Learner)
 
 
 def register(kind: str) -> Callable[[type[L]], type[L]]:
     """Let recipes name a learner by ``algo.kind``.
-
-    Args:
-        kind: its name.
 
     Example:
         >>> @register("nothing")  # doctest: +SKIP
@@ -229,11 +209,7 @@ def config_class(kind: object) -> type[AlgoConfig]:
 
 
 def snapshot(state: Any) -> Any:
-    """Copy of a nested state on the CPU that shares no memory with the original.
-
-    Args:
-        state: tensors and plain values in dicts, lists and tuples.
-    """
+    """Copy of a nested state on the CPU that shares no memory with the original."""
     if isinstance(state, Tensor):
         return state.detach().to("cpu", copy=True)
     if isinstance(state, dict):

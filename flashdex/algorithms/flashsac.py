@@ -1,4 +1,4 @@
-"""FlashSAC: networks, loss and optimisers of a recipe, and packed replay around them."""
+"""FlashSAC: networks, loss and optimisers of a recipe, and replay around them."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ class FlashSACLearner(Learner):
         self.nstep = NStepAssembler(
             config.n_step, gamma=config.gamma, device=self.device
         )
-        self.buffer: RowBuffer = make_buffer(
+        self.buffer = make_buffer(
             config, device=self.device, generator=self.generator, seed=spec.seed
         )
         self._patch = RowPatch(self.device, ones=self.rows.ones)
@@ -341,30 +341,25 @@ class FlashSACLearner(Learner):
 
     @classmethod
     def conflicts(
-        cls,
-        config: AlgoConfig,
-        *,
-        total_env_steps: int,
-        num_envs: int,
-        worlds_key: str,
+        cls, config: AlgoConfig, budget: int, worlds: dict[str, int]
     ) -> list[str]:
         """See ``Learner.conflicts``; also between buffer, budget and worlds."""
-        sizes = {"total_env_steps": total_env_steps, "num_envs": num_envs}
-        problems = super().conflicts(config, **sizes, worlds_key=worlds_key)
+        problems = super().conflicts(config, budget, worlds)
         if config.min_buffer > config.buffer_size:
             problems.append(
                 f"algo.min_buffer: {config.min_buffer} rows never fit in "
                 f"algo.buffer_size={config.buffer_size}; learning would not start"
             )
-        if config.min_buffer >= total_env_steps > 1:
+        if config.min_buffer >= budget > 1:
             problems.append(
                 f"algo.min_buffer: {config.min_buffer} rows of random actions use up "
-                f"total_env_steps={total_env_steps}"
+                f"total_env_steps={budget}"
             )
         # The newest n steps of every world have no complete return yet.
+        ((key, num_envs),) = worlds.items()
         if config.buffer_size <= num_envs * config.n_step:
             problems.append(
-                f"algo.buffer_size: {config.buffer_size} must exceed {worlds_key} x "
+                f"algo.buffer_size: {config.buffer_size} must exceed {key} x "
                 f"algo.n_step = {num_envs * config.n_step}"
             )
         return problems

@@ -294,14 +294,14 @@ class PPOLearner(Learner):
         return f"algo.ppo.lr={config.ppo.lr / 2:g}"
 
     @classmethod
-    def row_count(cls, config: AlgoConfig, *, num_envs: int) -> int:
+    def row_count(cls, config: AlgoConfig, num_envs: int) -> int:
         """Rows of a rollout."""
         return num_envs * config.ppo.horizon
 
     @classmethod
-    def batch_rows(cls, config: AlgoConfig, *, num_envs: int) -> int:
+    def batch_rows(cls, config: AlgoConfig, num_envs: int) -> int:
         """Rows of a minibatch."""
-        return -(-cls.row_count(config, num_envs=num_envs) // config.ppo.minibatches)
+        return -(-cls.row_count(config, num_envs) // config.ppo.minibatches)
 
 
 def make_ppo(config: AlgoConfig, rows: HandRows, generator: torch.Generator) -> PPO:

@@ -29,8 +29,8 @@ class FlashPolicy(TensorDictModuleBase):
         observation: key of the observation, (N, D).
         future: key of the future window, (N, C, K), read if the actor has an encoder.
         action: name of the action inside its group.
-        deterministic_key: key of a flag (N, 1); where it is true, actions are deterministic even
-            under RANDOM. None: no such flag.
+        deterministic_key: key of a flag (N, 1); where it is true, actions are
+            deterministic even under RANDOM. None: no such flag.
     """
 
     def __init__(

@@ -67,21 +67,17 @@ def _rate(recipe: Recipe) -> list[str]:
 
 
 def _algo(recipe: Recipe) -> list[str]:
-    budget, worlds = recipe.total_env_steps, recipe.env.num_envs
-    return algo_conflicts(recipe.algo, recipe.task, budget, {"env.num_envs": worlds})
+    return algo_conflicts(recipe, {"env.num_envs": recipe.env.num_envs})
 
 
-def algo_conflicts(
-    algo: AlgoConfig, task: str, total_env_steps: int, worlds: dict[str, int]
-) -> list[str]:
+def algo_conflicts(recipe: Recipe | GymRecipe, worlds: dict[str, int]) -> list[str]:
     """Return what does not fit between algorithm, task, budget and worlds.
 
     Args:
-        algo: algorithm part of a recipe.
-        task: its kind.
-        total_env_steps: budget.
+        recipe: of either kind.
         worlds: their number, by the recipe key that gives it.
     """
+    algo, task = recipe.algo, recipe.task
     try:
         learner = find_algorithm(algo.kind)
     except FlashdexError as error:
@@ -92,10 +88,7 @@ def algo_conflicts(
             f"algo.kind: '{algo.kind}' is not available with task: {task}; use "
             f"{' or '.join(able)}"
         ]
-    ((key, num_envs),) = worlds.items()
-    return learner.conflicts(
-        algo, total_env_steps=total_env_steps, num_envs=num_envs, worlds_key=key
-    )
+    return learner.conflicts(algo, recipe.total_env_steps, worlds)
 
 
 def _env(recipe: Recipe) -> list[str]:
@@ -181,12 +174,7 @@ def find_gym_conflicts(recipe: GymRecipe) -> list[str]:
     return [
         *_environment(recipe),
         *_hand_keys(recipe.algo),
-        *algo_conflicts(
-            recipe.algo,
-            recipe.task,
-            recipe.total_env_steps,
-            {"gym.num_envs": recipe.gym.num_envs},
-        ),
+        *algo_conflicts(recipe, {"gym.num_envs": recipe.gym.num_envs}),
         *expect_conflicts(recipe.expect),
     ]
 

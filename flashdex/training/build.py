@@ -41,9 +41,6 @@ _LOG = logging.getLogger(__name__)
 def load_library(recipe: Recipe) -> MotionLibrary:
     """Load the library of a recipe; prepare it where there is none or it is old.
 
-    Args:
-        recipe: validated recipe.
-
     Raises:
         FlashdexError: it names no motions, or they cannot be read.
     """
@@ -210,11 +207,11 @@ class RunBuilder:
         seed: int | None = None,
         evaluation: bool = False,
     ) -> TrackingEnv:
-        """Build physics and environment.
+        """Build physics and environment, as the recipe says where None.
 
         Args:
-            num_envs: worlds; the recipe's number when None.
-            seed: of resets; the recipe's when None.
+            num_envs: worlds.
+            seed: of resets.
             evaluation: no terminations, no noise, every world an attempt.
         """
         recipe = self.recipe
@@ -299,10 +296,7 @@ class RunBuilder:
 
 
 def learner_device(recipe: Recipe) -> torch.device:
-    """Where a recipe learns.
-
-    Args:
-        recipe: ``algo.device`` names it; auto is a GPU where there is one.
+    """Where a recipe learns; ``algo.device=auto`` is a GPU where there is one.
 
     Raises:
         FlashdexError: it asks for a GPU, and torch sees none.

@@ -170,8 +170,9 @@ def stop_with_dump(
         f"{run_dir}: not finite after {env_steps} env steps and {learner.updates} "
         f"updates: {cause}. {where} No checkpoint was written over; the newest good "
         f"one is {newest_checkpoint(run_dir)}. Go on from it with a smaller learning "
-        f"rate, say: flashdex train --resume {run_dir} {learner.gentler(recipe.algo)}. To repeat "
-        "the update see 'NaN' in docs/runs.md."
+        f"rate, say: flashdex train --resume {run_dir} "
+        f"{learner.gentler(recipe.algo)}. To repeat the update see 'NaN' in "
+        "docs/runs.md."
     )
 
 
@@ -185,11 +186,7 @@ def _cause(what: str, state: Any, update: Any) -> str:
 
 
 def read_dump(path: Path) -> dict[str, Any]:
-    """Read a dump as plain data.
-
-    Args:
-        path: the file.
-    """
+    """Read a dump as plain data."""
     try:
         dump = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:

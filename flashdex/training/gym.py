@@ -21,6 +21,7 @@ from flashdex.envs.gym import GymEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import GymRecipe, RunRecipe, expect_kind
 from flashdex.training.session import SIGNAL, SessionStart
+from flashdex.training.task import Task
 
 if TYPE_CHECKING:
     from flashdex.training.trainer import Trainer
@@ -31,12 +32,8 @@ _LOG = logging.getLogger(__name__)
 SEED_OFFSET = 2**30
 
 
-class GymTask:
-    """See `flashdex.training.trainer.Task`.
-
-    Args:
-        recipe: names the environment.
-    """
+class GymTask(Task):
+    """Returns and evaluations of a stock environment."""
 
     worlds_key = "gym.num_envs"
     # checkpoints of earlier versions hold no more
@@ -45,11 +42,11 @@ class GymTask:
     updates_during_step = False
 
     def __init__(self, recipe: GymRecipe) -> None:
-        self.recipe, self.note = recipe, "no evaluation yet"
+        self.recipe, self._note = recipe, "no evaluation yet"
         self.record_due = False  # an evaluation is
 
     @classmethod
-    def open(cls, recipe: RunRecipe, run_dir: Path) -> GymTask:
+    def open(cls, recipe: RunRecipe, run_dir: Path | None = None) -> GymTask:
         """Refuse an environment that cannot be used.
 
         Raises:
@@ -65,18 +62,13 @@ class GymTask:
         task.make_env(num_envs=1).close()
         return task
 
-    @classmethod
-    def open_to_evaluate(cls, recipe: RunRecipe) -> GymTask:
-        """See ``open``."""
-        return cls.open(recipe, Path())
-
     def make_env(self, *, num_envs: int | None = None) -> GymEnv:
-        """Make the training worlds, as many as the recipe says when None."""
+        """See ``Task``."""
         gym = self.recipe.gym
         return GymEnv(gym, num_envs=num_envs or gym.num_envs, seed=self.recipe.seed)
 
     def make_learner(self, env: GymEnv) -> Learner:
-        """Build the recipe's algorithm for an environment."""
+        """See ``Task``."""
         recipe = self.recipe
         spec = TaskSpec(
             example=env.reset(),
@@ -105,12 +97,6 @@ class GymTask:
         self.env.seed = self.recipe.seed + start.env_steps
         self._evaluated_at = start.env_steps
 
-    def after_reset(self) -> None:
-        """Nothing."""
-
-    def after_physics(self, trainer: Trainer, action: Tensor, done: Tensor) -> None:
-        """Nothing."""
-
     def after_step(self, trainer: Trainer, after: TensorDictBase) -> None:
         """Count returns, those not finite as 0, and see whether to evaluate."""
         reward, done = after[keys.REWARD], after[keys.DONE]
@@ -133,16 +119,14 @@ class GymTask:
         """Rewards, (N, 1)."""
         return after[keys.REWARD]
 
-    def settle(self, trainer: Trainer) -> None:
-        """Nothing is in line."""
-
-    def end_reason(self) -> str:
-        """Nothing but budget and limits ends it."""
-        return ""
-
     def finish(self, trainer: Trainer, why: str) -> None:
         """Ask for a closing evaluation, unless somebody wants the run to end."""
         self.record_due = why != SIGNAL and trainer.env_steps > self._evaluated_at
+
+    @property
+    def note(self) -> str:
+        """Return of the newest evaluation."""
+        return self._note
 
     @property
     def num_results(self) -> int:
@@ -162,7 +146,7 @@ class GymTask:
         with trainer.stats.time("evaluate"):
             found = self._play(trainer.learner, lambda: trainer.stop.requested)
         metrics = found.metrics()
-        self.note = f"return {metrics['eval/return']:.1f}"
+        self._note = f"return {metrics['eval/return']:.1f}"
         _LOG.info(
             "%d of %d env steps, return %.1f +- %.1f over %d episodes, %.0f s",
             trainer.env_steps,
@@ -184,13 +168,6 @@ class GymTask:
             return evaluate_policy(learner, env, should_stop=should_stop)
         finally:
             env.close()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: unfinished episodes begin anew."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing."""
 
     def evaluate(self, learner: Learner, env_steps: int) -> dict[str, Any]:
         """Play the evaluation episodes of the recipe.

@@ -115,7 +115,7 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> dict[str, A
     run_dir = Path(run)
     recipe = load_run_recipe(run_dir, overrides)
     state = load_checkpoint(run_dir, task_of(recipe).evaluated_keys)
-    task = task_of(recipe).open_to_evaluate(recipe)
+    task = task_of(recipe).open(recipe)
     _set_up_process(recipe)
     # The learner keeps a running return a world: as many as it was trained with.
     num_envs = stored_value(_stored_recipe(run_dir, state), task.worlds_key)
@@ -336,7 +336,7 @@ def reopen(path: str | Path) -> tuple[Learner, Callable[[], TensorDictBase]]:
         file = Path(folder) / RECIPE
         file.write_text(dump["recipe"], encoding="utf-8")
         recipe = load_recipe(file)
-    task = task_of(recipe).open_to_evaluate(recipe)
+    task = task_of(recipe).open(recipe)
     learner = task.make_learner(task.make_env())
     learner.load_state_dict(dump["learner"])
     update = dump["update"]

@@ -81,21 +81,9 @@ def begin_session(
 
 
 def end_session(run_dir: Path, why: str, *, env_steps: int, wall_s: float) -> None:
-    """Write the ``end`` line; a session without one crashed, or is running.
-
-    Args:
-        run_dir: run directory.
-        why: what ended it.
-        env_steps: counter at the end.
-        wall_s: clock at the end, s.
-    """
-    line = {
-        "event": "end",
-        "date": _now(),
-        "env_steps": env_steps,
-        "wall_s": wall_s,
-        "why": why,
-    }
+    """Write the ``end`` line; a session without one crashed, or is running."""
+    counters = {"env_steps": env_steps, "wall_s": wall_s}
+    line = {"event": "end", "date": _now(), **counters, "why": why}
     append_line(run_dir / SESSIONS, line)
 
 
@@ -120,11 +108,7 @@ def _now() -> str:
 
 
 def stored_value(text: str, key: str) -> Any:
-    """Value of a recipe as it was composed, None where it has no such key.
-
-    Args:
-        text: recipe of a checkpoint, YAML.
-        key: dotted path.
+    """Value of a recipe, YAML, None where it has no such key.
 
     Example:
         >>> stored_value("algo: {v_max: 5.0}", "algo.v_max")
@@ -143,12 +127,11 @@ def refuse_changes(text: str, recipe: RunRecipe) -> None:
     Raises:
         RunError: one message with every value that differs.
     """
-    stored = OmegaConf.create(text)
-    present = OmegaConf.create(dataclasses.asdict(recipe))
-    algorithm = find_algorithm(OmegaConf.select(stored, "algo.kind"))
+    present = OmegaConf.to_yaml(dataclasses.asdict(recipe))
+    algorithm = find_algorithm(stored_value(text, "algo.kind"))
     changed = []
     for key in (*LABELS, *algorithm.immutable_keys):
-        was, now = OmegaConf.select(stored, key), OmegaConf.select(present, key)
+        was, now = stored_value(text, key), stored_value(present, key)
         if was != now:
             changed.append(f"{key} from {was} to {now}")
     if changed:

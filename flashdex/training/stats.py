@@ -63,13 +63,7 @@ class RunningStats:
         self._tables[tuple(names)] = sums, counts
 
     def add_step(self, outcome: Outcome, done: Tensor, terminated: Tensor) -> None:
-        """Take in one judged vector step.
-
-        Args:
-            outcome: rewards and errors.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-        """
+        """Take in one judged vector step; flags are (N, 1) bool."""
         values = {f"reward/{{side}}/{k}": v for k, v in outcome.terms.items()}
         values["reward/{side}/total"] = outcome.reward
         values["error/{side}/object_pos_mm"] = outcome.object_pos_error * 1e3
@@ -86,11 +80,11 @@ class RunningStats:
     def add_ends(
         self, done: Tensor, terminated: Tensor, causes: dict[str, Tensor] | None = None
     ) -> None:
-        """Count one vector step and the episodes that ended in it.
+        """Count one vector step and the episodes that ended in it, (N, 1) bool.
 
         Args:
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
+            done: ended.
+            terminated: failed.
             causes: for what; (N, 2) bool each, by hand.
         """
         self._steps += 1

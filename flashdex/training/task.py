@@ -10,7 +10,6 @@ from torch import Tensor
 
 from flashdex.algorithms.base import Learner
 from flashdex.errors import RunError
-from flashdex.recipe import RunRecipe
 from flashdex.training.session import SessionStart
 
 if TYPE_CHECKING:
@@ -26,6 +25,7 @@ class Task(Protocol):
         resumed_keys: what it must hold to be gone on from.
         updates_during_step: an off-policy learner learns while the physics steps, on
             the rows before that step; otherwise after it.
+        recipe: validated recipe.
         env: the environment, from ``prepare`` on.
         record_due: write a record after this step.
         note: what was achieved, in a few words.
@@ -39,7 +39,7 @@ class Task(Protocol):
     updates_during_step: ClassVar[bool]
     recipe: Any
     env: Any
-    record_due: bool
+    record_due: bool = False
 
     @property
     def note(self) -> str: ...  # noqa: D102
@@ -49,13 +49,8 @@ class Task(Protocol):
     def rows_meaning(self) -> str: ...  # noqa: D102
 
     @classmethod
-    def open(cls, recipe: RunRecipe, run_dir: Path) -> Task:
-        """Load what a recipe names; refuse what cannot be trained."""
-        ...
-
-    @classmethod
-    def open_to_evaluate(cls, recipe: RunRecipe) -> Task:
-        """Load what a recipe names."""
+    def open(cls, recipe: Any, run_dir: Path | None = None) -> Task:
+        """Load what a recipe names; with a run directory, to train in it."""
         ...
 
     def make_env(self, *, num_envs: int | None = None) -> Any:
@@ -67,20 +62,16 @@ class Task(Protocol):
         ...
 
     def prepare(self, run_dir: Path, env: Any, *, changed: bool) -> None:
-        """Open what may refuse a session; ``changed``: by overrides, since the last."""
-        ...
+        """Open what may refuse a session; ``changed``: overrides were given."""
 
     def begin(self, start: SessionStart, state: dict[str, Any] | None) -> None:
         """Open the rest; ``state`` is the checkpoint that is gone on from."""
-        ...
 
     def after_reset(self) -> None:
         """Some worlds have begun new episodes."""
-        ...
 
     def after_physics(self, trainer: Trainer, action: Tensor, done: Tensor) -> None:
         """The environment has stepped; the learner may still be at work."""
-        ...
 
     def rewards(self, after: TensorDictBase) -> Tensor:
         """Rewards as the learner takes them, of the state after a step."""
@@ -88,7 +79,6 @@ class Task(Protocol):
 
     def after_step(self, trainer: Trainer, after: TensorDictBase) -> None:
         """The step is stored; ``after`` is the state before any reset."""
-        ...
 
     def metrics(self, trainer: Trainer) -> dict[str, float]:
         """What a record says of the task."""
@@ -96,7 +86,7 @@ class Task(Protocol):
 
     def end_reason(self) -> str:
         """Why the run may end now, empty when it may not."""
-        ...
+        return ""
 
     def settle(self, trainer: Trainer) -> RunError | None:
         """Finish what is in line; the error that made it impossible."""
@@ -104,20 +94,17 @@ class Task(Protocol):
 
     def finish(self, trainer: Trainer, why: str) -> None:
         """The loop has ended; a last record follows."""
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """The task's entries of a checkpoint."""
-        ...
+        return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict`` from a whole checkpoint."""
-        ...
 
     def evaluate(self, learner: Learner, env_steps: int) -> dict[str, Any]:
-        """Scores of a learner, as JSON."""
+        """Scores of a learner after so many env steps, as JSON."""
         ...
 
     def close(self, *, wait: bool) -> None:
         """Free everything; ``wait`` finishes what is in line first."""
-        ...

@@ -36,6 +36,7 @@ from flashdex.training.evaluator import evaluate_motions
 from flashdex.training.memory import check_memory
 from flashdex.training.memory_library import find_library
 from flashdex.training.session import SessionStart
+from flashdex.training.task import Task
 
 if TYPE_CHECKING:
     from flashdex.training.trainer import Trainer
@@ -45,27 +46,23 @@ BASELINES = "baselines.json"
 _ROOM = {"contacts": "physics.nconmax", "constraints": "physics.njmax"}
 
 
-class TrackingTask:
-    """See `flashdex.training.trainer.Task`.
-
-    Args:
-        builder: motions and recipe.
-    """
+class TrackingTask(Task):
+    """Attempts at motions, judged and certified."""
 
     worlds_key = "env.num_envs"
     evaluated_keys, resumed_keys = EVALUATED, RESUMED
     updates_during_step = True
-    record_due = False
 
     def __init__(self, builder: RunBuilder) -> None:
         self.builder, self.recipe = builder, builder.recipe
-        self.make_env, self.make_learner = builder.make_env, builder.make_learner
         self.assist_epoch = AssistEpoch()
 
     @classmethod
-    def open(cls, recipe: RunRecipe, run_dir: Path) -> TrackingTask:
-        """Prepare the motions of a recipe; refuse what cannot fit into memory."""
+    def open(cls, recipe: RunRecipe, run_dir: Path | None = None) -> TrackingTask:
+        """Prepare the motions; to train, refuse what cannot fit into memory."""
         recipe = expect_kind(recipe, Recipe, where=str(run_dir))
+        if run_dir is None:
+            return cls(RunBuilder.from_recipe(recipe))
         device = learner_device(recipe)
         if recipe.algo.replay == "pinned":
             check_pinning(device)
@@ -75,11 +72,13 @@ class TrackingTask:
         _LOG.info("%s", check_memory(recipe, library=builder.library, run_dir=run_dir))
         return cls(builder)
 
-    @classmethod
-    def open_to_evaluate(cls, recipe: RunRecipe) -> TrackingTask:
-        """Prepare the motions of a recipe."""
-        recipe = expect_kind(recipe, Recipe, where="evaluate")
-        return cls(RunBuilder.from_recipe(recipe))
+    def make_env(self, *, num_envs: int | None = None) -> TrackingEnv:
+        """See ``Task``."""
+        return self.builder.make_env(num_envs=num_envs)
+
+    def make_learner(self, env: TrackingEnv) -> Learner:
+        """See ``Task``."""
+        return self.builder.make_learner(env)
 
     @cached_property
     def provenance(self) -> dict[str, str]:
@@ -107,13 +106,7 @@ class TrackingTask:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
-        """Score the baselines and open the ledger.
-
-        Args:
-            run_dir: run directory, locked.
-            env: of the run.
-            changed: the recipe is another one now; its baselines are, too.
-        """
+        """Score the baselines, anew where the recipe changed, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         if changed:
             (run_dir / BASELINES).unlink(missing_ok=True)
@@ -210,9 +203,6 @@ class TrackingTask:
         stops = self.recipe.train.stop_when_all_converted
         return "all converted" if stops and everything else ""
 
-    def finish(self, trainer: Trainer, why: str) -> None:
-        """Nothing: attempts are judged as they come."""
-
     @property
     def note(self) -> str:
         """What was achieved, in a few words."""
@@ -265,7 +255,7 @@ class TrackingTask:
         restore_generator(self.env.generator, state["env_generator"])
 
     def evaluate(self, learner: Learner, env_steps: int) -> dict[str, Any]:
-        """See `flashdex.training.evaluator.evaluate_motions`."""
+        """See ``Task``."""
         return evaluate_motions(self.builder, learner, env_steps=env_steps)
 
     def close(self, *, wait: bool) -> None:
@@ -276,14 +266,7 @@ class TrackingTask:
 def open_ledger(
     builder: RunBuilder, run_dir: Path, trivial: dict[str, list[str]], *, on_gpu: bool
 ) -> Ledger:
-    """The ledger of a run directory.
-
-    Args:
-        builder: motions and recipe.
-        run_dir: run directory.
-        trivial: motions that a baseline already passes, and which ones do.
-        on_gpu: a GPU steps the physics.
-    """
+    """The ledger of a run; ``trivial``: which baselines already pass a motion."""
     recipe = builder.recipe
     return Ledger(
         run_dir,
@@ -298,11 +281,7 @@ def open_ledger(
 
 
 def start_judge(order: JudgeOrder) -> tuple[Ledger, AttemptMaker]:
-    """Build ledger and maker in the judging process.
-
-    Args:
-        order: what the run told it.
-    """
+    """Build ledger and maker in the judging process."""
     builder = RunBuilder.from_recipe(order.recipe, device=torch.device("cpu"))
     scenes = build_scenes(builder.library, builder.hands, order.recipe.physics)
     maker = builder.attempt_maker(

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +39,7 @@ PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal
 
 
 class Progress:
-    """Shows env steps and what was achieved.
-
-    Args:
-        name: of the recipe.
-        total: env steps of the run.
-        done: of them, those of earlier sessions.
-    """
+    """A bar of env steps; without a terminal, a line in the log now and then."""
 
     def __init__(self, name: str, *, total: int, done: int) -> None:
         self.total = total
@@ -62,7 +56,7 @@ class Progress:
         self._last_line = time.monotonic()
 
     def show(self, note: str, *, env_steps: int, wall_s: float) -> None:
-        """Show a note beside the bar, or log a line if the last one is old enough."""
+        """Show what was achieved."""
         self.bar.set_postfix_str(note)
         now = time.monotonic()
         if self.bar.disable and now - self._last_line >= PLAIN_LOG_S:
@@ -76,10 +70,8 @@ class BackgroundWorker:
     """Runs one piece of work while the body of a ``with`` block runs.
 
     The work and the block must share nothing that either changes; then the outcome is
-    that of the work done first and the block after it, whichever is on.
-
-    Args:
-        threaded: False does just that, one after the other.
+    that of the work done first and the block after it, which is what ``threaded=False``
+    does.
 
     Example:
         >>> done = []
@@ -98,18 +90,12 @@ class BackgroundWorker:
             self._pool.submit(torch.get_num_threads).result()
 
     @contextmanager
-    def run(self, work: Callable[[], None] | None) -> Iterator[None]:
+    def run(self, work: Callable[[], None]) -> Iterator[None]:
         """Do ``work`` beside the block; both have ended when the block is left.
-
-        Args:
-            work: what to do; None is nothing.
 
         Raises:
             BaseException: what ``work`` raised, unless the block raised first.
         """
-        if work is None:
-            yield
-            return
         if self._pool is None:
             work()
             yield
@@ -230,7 +216,7 @@ class Trainer:
             action = self.learner.act(td.to(self.learner.device))
             self.env.put_action(td, action)
         # The updates read rows and write weights, the step does neither.
-        with self.worker.run(self._update if self.learns_beside else None):
+        with self.worker.run(self._update) if self.learns_beside else nullcontext():
             with self.stats.time("env"):
                 td = self.env.step(td)
             after = td.get("next")

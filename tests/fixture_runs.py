@@ -1,4 +1,4 @@
-"""Workbenches and learners of tiny sizes on the synthetic library."""
+"""Builders and learners of tiny sizes on the synthetic library."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TINY = {
 
 @pytest.fixture
 def make_bench(library, hands, bank):
-    """Build a workbench: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
+    """Make a RunBuilder: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
     from flashdex.training.build import RunBuilder
 
     def make(num_envs=6, *, algo=None, train=None, **env):

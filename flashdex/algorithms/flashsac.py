@@ -76,8 +76,7 @@ class FlashSACAgent:
         rows: sizes and group names.
         num_envs: worlds that are collected from.
         total_updates: horizon of the learning-rate schedule.
-        generator: source of the exploration and policy noise; its device is that of
-            everything else.
+        generator: of the exploration and policy noise, on the device of everything.
     """
 
     def __init__(
@@ -234,8 +233,8 @@ class FlashSACLearner(Learner):
         chance = 2 * chance - 1
         if self.rows.deterministic_key is None:
             return chance
-        quiet = state[self.rows.deterministic_key].unsqueeze(-1)
-        return torch.where(quiet, action, chance)
+        still = state[self.rows.deterministic_key].unsqueeze(-1)
+        return torch.where(still, action, chance)
 
     def process_step(
         self,

@@ -22,12 +22,7 @@ CHUNK = 4096  # rows assembled at once
 
 
 class PPOInputs:
-    """Observation and future window with running statistics of both.
-
-    Args:
-        rows: assembles them.
-        device: where everything lives.
-    """
+    """Observation and future window with running statistics of both."""
 
     def __init__(self, rows: HandRows, device: torch.device) -> None:
         self.rows, self.transforms = rows, rows.transforms

@@ -56,12 +56,7 @@ BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_referen
 
 
 def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
-    """Roll and score all baselines on all motions; reuse the file of this run.
-
-    Args:
-        builder: motions and recipe.
-        path: JSON file that keeps the result.
-    """
+    """Roll and score all baselines on all motions; reuse the file of this run."""
     if path is not None and path.is_file():
         return Baselines(json.loads(path.read_text(encoding="utf-8")))
     joints = builder.bank.num_joints
@@ -110,11 +105,7 @@ def _row(builder: RunBuilder, signals: Signals, grace: int) -> dict[str, Any]:
 
 
 def format_baselines(baselines: Baselines) -> str:
-    """A table: how many motions each baseline passes, by criterion.
-
-    Args:
-        baselines: from ``score_baselines``.
-    """
+    """A table: how many motions each baseline passes, by criterion."""
     names = list(baselines.rows)
     total = len(next(iter(baselines.rows.values())))
     lines = [

@@ -167,10 +167,6 @@ class RunBuilder:
     ) -> RunBuilder:
         """Load or prepare the motions of a recipe and check that they fit it.
 
-        Args:
-            recipe: validated recipe.
-            device: of the bank; that of the physics when None.
-
         Raises:
             LibraryError: the library is missing, of another hand or of another rate.
         """
@@ -207,13 +203,7 @@ class RunBuilder:
         seed: int | None = None,
         evaluation: bool = False,
     ) -> TrackingEnv:
-        """Build physics and environment, as the recipe says where None.
-
-        Args:
-            num_envs: worlds.
-            seed: of resets.
-            evaluation: no terminations, no noise, every world an attempt.
-        """
+        """Build physics and environment, as the recipe says where None."""
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
         physics = make_physics(self.library, self.hands, recipe.physics, count)
@@ -241,14 +231,7 @@ class RunBuilder:
         made_by: dict[str, Any] | None = None,
         provenance: dict[str, str] | None = None,
     ) -> AttemptMaker:
-        """Build what turns episodes into rollouts.
-
-        Args:
-            scenes: of all motions.
-            made_by: engine, versions and hardware of the states; this machine's, when
-                None.
-            provenance: stored with every rollout.
-        """
+        """Build what turns episodes into rollouts."""
         recipe, device = self.recipe, self.bank.table.device
         return AttemptMaker(
             self.bank_on(torch.device("cpu")),

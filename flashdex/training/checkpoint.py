@@ -76,10 +76,6 @@ def load_checkpoint(
     One that cannot (a full or failing disk) is named in a warning, and the one before
     is taken.
 
-    Args:
-        run_dir: run directory.
-        needs: keys the caller reads, `EVALUATED` or `RESUMED` say.
-
     Raises:
         RunError: there is none, none can be read, another version wrote it, or a key
             is missing.

@@ -85,11 +85,6 @@ def evaluate_motions(
 ) -> dict[str, Any]:
     """Roll every motion from frame 0, deterministic, no assist, no terminations.
 
-    Args:
-        builder: motions and recipe.
-        learner: acts.
-        env_steps: counter of its checkpoint.
-
     Returns:
         ``totals``, rates and mean errors of the collection, and ``motions``, for each
         its name, the state of each verdict and its errors.

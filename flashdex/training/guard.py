@@ -58,9 +58,6 @@ def numeric_errors(learner: Learner) -> Iterator[None]:
     The projection of a target indexes with what the networks say, and fails on NaN
     before there is any gradient.
 
-    Args:
-        learner: performs an update inside the block.
-
     Raises:
         NonFiniteError: an error came up, and its batch or its state is not finite.
     """
@@ -136,16 +133,7 @@ def stop_with_dump(
     env_steps: int,
     metrics: dict[str, float] | None = None,
 ) -> RunError:
-    """Write ``nan_dump.pt`` and return the error that says how to go on.
-
-    Args:
-        run_dir: run directory.
-        what: what was not finite where it was noticed.
-        recipe: of the run, of any kind.
-        learner: as the failing update left it.
-        env_steps: of the run.
-        metrics: newest record.
-    """
+    """Write ``nan_dump.pt`` and return the error that says how to go on."""
     state = snapshot(learner.state_dict())
     update = snapshot(learner.last_update)
     cause = _cause(what, state, update)

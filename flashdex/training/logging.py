@@ -52,12 +52,7 @@ class JsonlWriter:
 
 
 class CsvWriter:
-    """Writes ``metrics.csv``; a new key adds a column, empty in the rows above.
-
-    Args:
-        run_dir: run directory.
-        env_steps: as for `JsonlWriter`.
-    """
+    """Writes ``metrics.csv``; a new key adds a column, empty in the rows above."""
 
     def __init__(self, run_dir: Path, *, env_steps: int | None = None) -> None:
         self._path = run_dir / "metrics.csv"
@@ -97,13 +92,7 @@ class CsvWriter:
 
 
 class WandbWriter:
-    """Weights & Biases, on its own axes: env steps and hours, never W&B's step.
-
-    Args:
-        run_dir: run directory; offline files go there.
-        recipe: names, tags and mode.
-        run_id: id of an earlier session of the same run.
-    """
+    """Weights & Biases, on its own axes: env steps and hours, never W&B's step."""
 
     def __init__(
         self, run_dir: Path, recipe: RunRecipe, *, run_id: str | None = None

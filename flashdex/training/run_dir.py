@@ -61,9 +61,6 @@ def task_of(recipe: RunRecipe) -> type[Task]:
 def train(recipe: RunRecipe) -> Path:
     """Train a recipe from the beginning; return its run directory.
 
-    Args:
-        recipe: validated recipe of any kind.
-
     Raises:
         RunError: the folder already holds a run.
     """
@@ -76,10 +73,6 @@ def train(recipe: RunRecipe) -> Path:
 
 def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     """Continue a run from its newest checkpoint, or from the start without one.
-
-    Args:
-        run: run directory.
-        overrides: ``key=value`` changes to the stored recipe.
 
     Raises:
         RunError: another process trains there, or the checkpoint does not fit the
@@ -104,10 +97,6 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
 
 def evaluate(run: str | Path, overrides: list[str] | None = None) -> dict[str, Any]:
     """Evaluate the newest policy of a run, as its kind of recipe does.
-
-    Args:
-        run: run directory with a checkpoint.
-        overrides: changes to the stored recipe, for instance other physics.
 
     Returns:
         What is written to ``evaluation.json`` in the run.
@@ -142,10 +131,6 @@ def _stored_recipe(run_dir: Path, state: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def new_run(run_dir: Path, recipe: RunRecipe) -> Iterator[None]:
     """Make the folder of a new run and hold it; nobody else may start one in it.
-
-    Args:
-        run_dir: its folder, existing or not.
-        recipe: what it will train.
 
     Raises:
         RunError: it holds a run, another process is at it, or it cannot be written.
@@ -231,12 +216,6 @@ def make_trainer(
 ) -> Trainer:
     """Build the trainer of a session, and write the session's first line.
 
-    Args:
-        task: what the recipe trains, overrides included.
-        run_dir: run directory, locked.
-        state: checkpoint to go on from, or None.
-        overrides: what the recipe was changed by.
-
     Raises:
         RunError: the checkpoint does not fit the recipe; nothing is changed then.
     """
@@ -271,11 +250,6 @@ def make_trainer(
 
 def restore(learner: Learner, state: dict[str, Any], *, worlds_key: str) -> None:
     """Put a checkpoint into a learner; its worlds begin new episodes.
-
-    Args:
-        learner: as the recipe makes it.
-        state: checkpoint.
-        worlds_key: recipe key of the number of worlds, for the message.
 
     Raises:
         RunError: it is of other networks, observations or worlds.

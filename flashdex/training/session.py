@@ -49,12 +49,6 @@ def begin_session(
     The counters go back to the checkpoint. The clock does not: it goes on from the
     latest moment that any file of the run knows of. Env steps beyond the checkpoint
     were simulated for nothing and are added up.
-
-    Args:
-        run_dir: run directory.
-        env_steps: counter of the checkpoint.
-        wall_s: clock of the checkpoint, s.
-        overrides: changes that the session was started with.
     """
     drop_cut_line(run_dir / SESSIONS)
     before = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "start"]
@@ -119,10 +113,6 @@ def stored_value(text: str, key: str) -> Any:
 
 def refuse_changes(text: str, recipe: RunRecipe) -> None:
     """Refuse a recipe under which the run would be another algorithm.
-
-    Args:
-        text: recipe of the checkpoint, YAML.
-        recipe: what the run is to go on with.
 
     Raises:
         RunError: one message with every value that differs.

@@ -49,12 +49,9 @@ class RunningStats:
         self._calls[phase] += 1
 
     def add(self, names: Sequence[str], sums: Tensor, counts: Tensor) -> None:
-        """Take in sums, and over how many values each of them goes.
+        """Take in sums (K,), and over how many values each goes, (K,) or () for all.
 
-        Args:
-            names: what is logged, K of them, the same at every call of their kind.
-            sums: (K,).
-            counts: (K,), or () for all.
+        The K names must be the same at every call of their kind.
         """
         sums, counts = sums.double(), counts.double().expand(len(names))
         known = self._tables.get(tuple(names))
@@ -105,12 +102,7 @@ class RunningStats:
         self.add(names, found, torch.ones_like(found))
 
     def pop(self, seconds: float, num_envs: int) -> dict[str, float]:
-        """Means since the last call, and forget them; waits for the device.
-
-        Args:
-            seconds: time since the last call.
-            num_envs: worlds of a vector step.
-        """
+        """Means since the last call, ``seconds`` ago; waits for the device."""
         out = {"episode/ends": 0.0, "episode/completed": 0.0}
         for names, (sums, counts) in self._tables.items():
             means = (sums / counts.clamp_min(1e-9)).tolist()

@@ -115,16 +115,7 @@ class BackgroundWorker:
 
 
 class Trainer:
-    """Owns the counters of a run and performs vector steps.
-
-    Args:
-        task: what is trained; ``begin`` was called.
-        run_dir: run directory.
-        learner: acts and learns.
-        log: metric writers.
-        start: where the session begins.
-        replay: stores replay rows with the checkpoints, or None.
-    """
+    """Owns the counters of a run and performs vector steps; the task has begun."""
 
     def __init__(
         self,

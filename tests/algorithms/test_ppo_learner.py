@@ -20,7 +20,7 @@ GROUPS = ("per_hand", "unified")
 
 @pytest.fixture
 def make_ppo(make_bench):
-    """Build workbench, environment and PPO learner; two of six worlds attempt."""
+    """Make builder, environment and PPO learner; two of six worlds attempt."""
 
     def make(groups="per_hand", *, ppo=None, **env):
         sizes = {"horizon": HORIZON, "epochs": 2, "minibatches": 2, "hidden": [16]}

@@ -33,7 +33,7 @@ ROOMY = Machine(gpu=None, host=100 * GB, disk=100 * GB)
 
 @pytest.fixture
 def trained(make_bench, collect):
-    """A tiny workbench, its learner after updates, and their plan."""
+    """A tiny builder, its learner after updates, and their plan."""
 
     def make(**options):
         bench = make_bench(6, **options)

@@ -17,7 +17,7 @@ from benchmarks.common.library import describe_scene
 from benchmarks.common.turns import BareTurns, Turns, measure, room_used
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.training.build import Workbench, open_workbench
+from flashdex.training.build import RunBuilder
 
 
 def main(words: Sequence[str] = ()) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def main(words: Sequence[str] = ()) -> dict[str, Any]:
     output.add_recipe_options(parser)
     parser.add_argument("--seconds", type=float, default=10.0, help="how long")
     args = parser.parse_intermixed_args(words)
-    bench = open_workbench(output.compose_bench(args))
+    bench = RunBuilder.from_recipe(output.compose_bench(args))
     begin = timer()
     env = bench.make_env()
     made = timer() - begin
@@ -47,7 +47,7 @@ def main(words: Sequence[str] = ()) -> dict[str, Any]:
     return output.emit(result, out=args.out)
 
 
-def describe_bench(bench: Workbench, env: TrackingEnv) -> dict[str, Any]:
+def describe_bench(bench: RunBuilder, env: TrackingEnv) -> dict[str, Any]:
     """What was measured: recipe, engine, device, worlds and scene."""
     return {
         "recipe": bench.recipe.name,

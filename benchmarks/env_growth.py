@@ -21,7 +21,7 @@ from benchmarks.common import output
 from benchmarks.common.library import bench_library
 from benchmarks.common.turns import Turns
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.training.build import open_workbench
+from flashdex.training.build import RunBuilder
 
 STEPS = 8  # control steps of a turn
 # objects, hulls, worlds; the first one is what the others are compared with
@@ -38,7 +38,7 @@ def make_env(
     changes = [f"motions.library={library}", "motions.count=null"]
     changes += [f"env.num_envs={worlds}", "physics.num_threads=1", *args.overrides]
     recipe = output.compose_tracking(args.recipe, changes)
-    return open_workbench(recipe).make_env()
+    return RunBuilder.from_recipe(recipe).make_env()
 
 
 def measure(all_turns: list[Turns], *, rounds: int) -> tuple[Rounds, Rounds]:

@@ -41,7 +41,7 @@ from flashdex.modules.future import FutureEncoder
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.objectives.stepper import FlashSACStepper
 from flashdex.system.allocator import keep_freed_memory
-from flashdex.training.build import open_workbench
+from flashdex.training.build import RunBuilder
 
 GAMMA, N_STEPS, FRAMES = 0.98, 3, 10
 BURN_IN = 2  # pairs of updates that are not counted
@@ -282,12 +282,12 @@ def measure_recipe(
         itself, ``whole`` everything; and the width it was measured at.
     """
     recipe = output.compose_tracking(name, ["algo.actor_delay=0", *overrides])
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     env = bench.make_env()
     learner = bench.make_learner(env)
     assert isinstance(learner, FlashSACLearner)
     _collect(env, learner, rows=ROWS_PER_BATCH * recipe.algo.batch_size)
-    codec, buffer = learner.codec, learner.buffer
+    codec, buffer = learner.rows.codec, learner.buffer
     state, _ = codec.unpack(buffer.draw())
     calls: dict[str, Update] = {
         "sample": lambda: codec.unpack(buffer.draw()),
@@ -320,7 +320,7 @@ def _collect(env: TrackingEnv, learner: FlashSACLearner, *, rows: int) -> None:
         after = td.get("next")
         reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
         ended = after[keys.TERMINATED], after[keys.DONE]
-        learner.remember(td, action, reward, after, *ended)
+        learner.process_step(td, action, reward, after, *ended)
         td = following
 
 

@@ -32,7 +32,7 @@ from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
 from flashdex.replay.codec import row_bytes
 from flashdex.system.machine import free_host
-from flashdex.training.build import learner_device, open_workbench
+from flashdex.training.build import RunBuilder, learner_device
 
 SOURCE_WORLDS = 64  # of the environment whose rows are copied into the ring
 SOURCE_STEPS = 24
@@ -65,7 +65,7 @@ def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
 
     Each figure but the filling takes some seconds.
     """
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     learner = bench.make_learner(env := bench.make_env())
     assert isinstance(learner, FlashSACLearner)
     device, rows = learner_device(recipe), recipe.algo.buffer_size
@@ -173,7 +173,7 @@ def _make_block(
         td = env.reset_worlds(td["next", keys.DONE].squeeze(-1))
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
-    rows, codec = rows[chosen], learner.codec
+    rows, codec = rows[chosen], learner.rows.codec
     return codec.pack(rows), seconds_each(lambda: codec.pack(rows), seconds=seconds)
 
 

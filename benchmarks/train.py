@@ -22,8 +22,9 @@ from benchmarks.common.turns import physics_rate, room_used
 from benchmarks.env import describe_bench
 from flashdex.recipe import Recipe
 from flashdex.system.allocator import keep_freed_memory
-from flashdex.training.assemble import BASELINES, make_trainer
-from flashdex.training.build import open_workbench
+from flashdex.training.build import RunBuilder
+from flashdex.training.run_dir import make_trainer
+from flashdex.training.tracking import BASELINES, TrackingTask
 from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too
@@ -112,20 +113,19 @@ def measure(
 def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], float]]:
     """A trainer in a temporary run folder, what it is, and the seconds it took."""
     begin = timer()
-    bench = open_workbench(recipe)
+    bench = RunBuilder.from_recipe(recipe)
     with tempfile.TemporaryDirectory(prefix="flashdex-bench-") as folder:
         # the baselines are scores of the collection, no part of the loop
         (Path(folder) / BASELINES).write_text("{}", encoding="utf-8")
         torch.manual_seed(recipe.seed)
-        trainer = make_trainer(bench, Path(folder), None, [])
+        trainer = make_trainer(TrackingTask(bench), Path(folder), None, [])
         described = describe_bench(bench, trainer.env)
         try:
             with trainer.guard:
                 yield trainer, described, timer() - begin
         finally:
-            trainer.alongside.close()
-            trainer.scorer.close(wait=False)
-            trainer.log.close()
+            trainer.worker.close()
+            trainer.close(wait=False)
 
 
 def _warm_up(trainer: Trainer) -> float:
@@ -139,12 +139,8 @@ def _warm_up(trainer: Trainer) -> float:
 
 def _restart(trainer: Trainer) -> TensorDictBase:
     """New episodes everywhere, as after a resume."""
-    forget = getattr(trainer.learner, "forget_episodes", None)
-    if forget is not None:
-        forget()
-    td = trainer.env.reset()
-    trainer.recorder.record_start()
-    return td
+    trainer.learner.forget_episodes()
+    return trainer.reset()
 
 
 def _ceilings(trainer: Trainer, *, seconds: float) -> tuple[float, float]:
@@ -155,7 +151,8 @@ def _ceilings(trainer: Trainer, *, seconds: float) -> tuple[float, float]:
     begin = end = timer()
     while end - begin < seconds or learner.updates < updates + 2:
         for _ in range(8):
-            for _ in range(learner.due()):  # as the loop asks: samples come together
+            # as the loop asks: samples come together
+            for _ in range(learner.num_updates()):
                 learner.update()
         end = timer()
     return physics, (learner.updates - updates) / (end - begin)

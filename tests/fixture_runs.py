@@ -1,4 +1,4 @@
-"""Workbenches and learners of tiny sizes on the synthetic library."""
+"""Builders and learners of tiny sizes on the synthetic library."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ TINY = {
 
 @pytest.fixture
 def make_bench(library, hands, bank):
-    """Build a workbench: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
-    from flashdex.training.build import Workbench
+    """Make a RunBuilder: worlds, then fields of EnvConfig; ``algo`` of AlgoConfig."""
+    from flashdex.training.build import RunBuilder
 
     def make(num_envs=6, *, algo=None, train=None, **env):
         small = {"object_points": {"num_points": 8}}
@@ -42,7 +42,7 @@ def make_bench(library, hands, bank):
             physics=PhysicsConfig(num_threads=1),
             train=TrainConfig(**(train or {})),
         )
-        return Workbench(recipe, library, hands, bank)
+        return RunBuilder(recipe, library, hands, bank)
 
     return make
 
@@ -50,7 +50,7 @@ def make_bench(library, hands, bank):
 @pytest.fixture(scope="module")
 def roll_tiny(library, hands, bank):
     """Roll every motion of the synthetic library under a controller."""
-    from flashdex.training.build import Workbench
+    from flashdex.training.build import RunBuilder
     from flashdex.training.evaluator import roll_all
 
     recipe = Recipe(
@@ -59,7 +59,7 @@ def roll_tiny(library, hands, bank):
         env=EnvConfig(num_envs=3, finger_mode="residual"),
         physics=PhysicsConfig(num_threads=1),
     )
-    bench = Workbench(recipe, library, hands, bank)
+    bench = RunBuilder(recipe, library, hands, bank)
 
     def roll(controller):
         return roll_all(bench, controller)
@@ -81,7 +81,7 @@ def collect():
             td, root = env.step_and_maybe_reset(td)
             after = td["next"]
             reward = torch.cat([after[keys.reward(s)] for s in keys.SIDES], -1)
-            learner.remember(
+            learner.process_step(
                 td, action, reward, after, after[keys.TERMINATED], after[keys.DONE]
             )
             td = root

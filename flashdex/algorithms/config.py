@@ -50,8 +50,9 @@ class PPOConfig:
 class AlgoConfig:
     """FlashSAC over groups of action dimensions, or the PPO baseline."""
 
-    kind: Literal["flashsac", "ppo"] = "flashsac"
-    """The algorithm; ppo is the paper's baseline and reads `algo.ppo`."""
+    kind: str = "flashsac"
+    """The algorithm: flashsac, or ppo, the paper's baseline, which reads `algo.ppo`;
+    others by `flashdex.algorithms.base.register`."""
     groups: Literal["per_hand", "unified"] = "per_hand"
     """One actor-critic a hand, or one for both with summed reward."""
     critic_action: Literal["joint", "own"] = "joint"

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs.transforms import Transform
 
 from flashdex import keys
-from flashdex.algorithms.agent import make_encoder
+from flashdex.algorithms.base import Learner, TaskSpec, register, snapshot
 from flashdex.algorithms.config import AlgoConfig
-from flashdex.algorithms.hand_groups import HandGroups
-from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.transforms.assembly import Assembly
+from flashdex.algorithms.inputs import HandRows, make_encoder
 from flashdex.errors import RunError
 from flashdex.modules.gaussian_policy import GaussianPolicy, RunningNorm, ValueNet
 from flashdex.modules.layers import restore_generator
@@ -26,35 +22,16 @@ CHUNK = 4096  # rows assembled at once
 
 
 class PPOInputs:
-    """Observation and future window with running statistics of both.
+    """Observation and future window with running statistics of both."""
 
-    Args:
-        transforms: observation transforms in data-flow order.
-        groups: how the hands are divided.
-        example: one compact state, batch (N,), that fixes the sizes.
-        compile: compile the assembly.
-    """
-
-    def __init__(
-        self,
-        transforms: list[Transform],
-        groups: HandGroups,
-        example: TensorDictBase,
-        *,
-        compile: bool = False,
-    ) -> None:
-        self.transforms, self.groups = transforms, groups
-        self.show = Assembly(transforms, compile=compile)
-        shown = Assembly(transforms)(example)
-        wanted = (keys.OBSERVATION, keys.FUTURE)
-        self.keys = [k for k in wanted if shown.get(k, None) is not None]
-        self.observation_dim = shown[keys.OBSERVATION].shape[-1]
-        self.future_shape: tuple[int, int] | None = None
-        if keys.FUTURE in self.keys:
-            channels, frames = shown[keys.FUTURE].shape[1:]
-            self.future_shape = (channels, frames)
-        norms = {key: RunningNorm(shown[key].shape[1]) for key in self.keys}
-        self.norms = nn.ModuleDict(norms).to(example[keys.JOINT_POS].device)
+    def __init__(self, rows: HandRows, device: torch.device) -> None:
+        self.rows, self.transforms = rows, rows.transforms
+        widths = {keys.OBSERVATION: rows.observation_dim}
+        if rows.future_shape is not None:
+            widths[keys.FUTURE] = rows.future_shape[0]
+        self.keys = list(widths)
+        norms = {key: RunningNorm(width) for key, width in widths.items()}
+        self.norms = nn.ModuleDict(norms).to(device)
 
     @property
     def fitted(self) -> bool:
@@ -74,9 +51,9 @@ class PPOInputs:
         """
         parts = []
         for chunk in state.split(CHUNK):
-            shown = self.show(chunk)
-            row: dict[str, Tensor] = {key: shown[key] for key in self.keys}
-            mask = self.groups.mask(shown[keys.GROUP_MASK])
+            seen = self.rows.assemble(chunk)
+            row: dict[str, Tensor] = {key: seen[key] for key in self.keys}
+            mask = self.rows.groups.mask(seen[keys.GROUP_MASK])
             for value in row.values():
                 mask = mask & value.flatten(1).isfinite().all(-1, keepdim=True)
             row[keys.GROUP_MASK] = mask
@@ -100,20 +77,13 @@ class PPOInputs:
         for key in self.keys:
             self.norm(key).update(raw[key][used])
 
-    def state_dict(self) -> dict[str, Any]:
-        """The statistics."""
-        return self.norms.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``."""
-        self.norms.load_state_dict(state)
-
 
 STEP = ("action", "reward", "finite", "terminated", "done")
 
 
-class PPOLearner:
-    """The paper's PPO baseline; see `flashdex.algorithms.base.Learner`.
+@register("ppo")
+class PPOLearner(Learner):
+    """The paper's PPO baseline.
 
     Each group of hands is a PPO learner of its own on the common observation. Attempt
     worlds act deterministically and are not learnt from: their actions are not samples
@@ -122,69 +92,45 @@ class PPOLearner:
     Rewards are scaled as FlashSAC's are, by the running spread of the discounted
     return, but over other worlds: here attempt worlds are left out of the statistics,
     there they count, so that the two learners see about the same numbers, not the same.
-
-    Args:
-        config: algorithm part of the recipe.
-        transforms: observation transforms in data-flow order.
-        bank: reference frames.
-        example: one compact state, batch (N,), that fixes the network sizes.
-        seed: of networks, actions and minibatches.
-        device: where everything lives; ``bank`` and ``example`` are there already.
     """
 
-    is_off_policy = False
-
-    def __init__(
-        self,
-        config: AlgoConfig,
-        transforms: list[Transform],
-        bank: ReferenceBank,
-        example: TensorDictBase,
-        *,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.config, self.bank, self.device = config, bank, torch.device(device)
-        self.groups = HandGroups.of(bank, unified=config.groups == "unified")
-        self.generator = torch.Generator(device).manual_seed(seed)
-        torch.manual_seed(seed)
-        transforms = [t.to(device) for t in transforms]
-        self.inputs = PPOInputs(
-            transforms, self.groups, example, compile=config.compile
-        )
+    def __init__(self, config: AlgoConfig, spec: TaskSpec) -> None:
+        self.config, self.device = config, spec.device
+        self.generator = torch.Generator(self.device).manual_seed(spec.seed)
+        torch.manual_seed(spec.seed)
+        rows = HandRows(config, spec)
+        self.bank, self.groups = rows.bank, rows.groups
+        self.inputs = PPOInputs(rows, self.device)
         self.agents = {
-            name: make_ppo(config, self.inputs, self.groups.action_dim, self.generator)
-            for name in self.groups.names
+            name: make_ppo(config, rows, self.generator) for name in self.groups.names
         }
         self.normalizer = RewardNormalizer(
-            example.batch_size[0],
+            spec.example.batch_size[0],
             len(self.groups.names),
             gamma=config.gamma,
             bound=config.v_max,
-        ).to(device)
+        ).to(self.device)
         # looked up once: which worlds attempt never changes
-        self._train_rows = (~example[keys.ATTEMPT].squeeze(-1)).nonzero().squeeze(-1)
-        self._dropped = torch.zeros((), dtype=torch.int64, device=device)
+        self._train_rows = (
+            (~spec.example[keys.ATTEMPT].squeeze(-1)).nonzero().squeeze(-1)
+        )
+        self._dropped = torch.zeros((), dtype=torch.int64, device=self.device)
         self._updates = 0
         self._rollout: list[TensorDict] = []
 
     @torch.no_grad()
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
-        """Actions of both hands, (N, 2, J); attempt worlds act deterministically.
+        """See ``Learner.act``.
 
         Samples are not clipped, so that their log-probability is that of the Gaussian;
         the environment clips.
-
-        Args:
-            state: compact state, batch (N,), with the ``attempt`` flag.
-            explore: False makes every world deterministic.
         """
         inputs = self.inputs(state)
-        quiet = self._join(inputs, explore=False).clamp(-1.0, 1.0)
+        mean = self._join(inputs, explore=False).clamp(-1.0, 1.0)
         if not explore:
-            return quiet
+            return mean
         noisy = self._join(inputs, explore=True)
-        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), quiet, noisy)
+        return torch.where(state[keys.ATTEMPT].unsqueeze(-1), mean, noisy)
 
     def _join(self, inputs: TensorDict, *, explore: bool) -> Tensor:
         actions = TensorDict({}, inputs.batch_size)
@@ -192,7 +138,7 @@ class PPOLearner:
             actions.set((name, keys.ACTION), agent.act(inputs, explore=explore))
         return self.groups.join(actions)
 
-    def remember(
+    def process_step(
         self,
         state: TensorDictBase,
         action: Tensor,
@@ -204,14 +150,6 @@ class PPOLearner:
         """Update the reward statistics and append the training worlds to the rollout.
 
         Steps whose reward is not finite are counted and not learnt from.
-
-        Args:
-            state: compact state before the step, batch (N,).
-            action: what ``act`` returned, (N, 2, J).
-            reward: per hand, (N, 2).
-            next_state: compact state after the step, before any reset.
-            terminated: (N, 1) bool.
-            done: (N, 1) bool.
         """
         train = ~state[keys.ATTEMPT]
         active = self.bank.hand_active[state[keys.MOTION].squeeze(-1)]
@@ -235,7 +173,7 @@ class PPOLearner:
         )
         self._rollout.append(cast(TensorDict, step[self._train_rows]))
 
-    def due(self) -> int:
+    def num_updates(self) -> int:
         """1 once the rollout is full; the first one only sets the input statistics."""
         if len(self._rollout) < self.config.ppo.horizon:
             return 0
@@ -315,13 +253,13 @@ class PPOLearner:
         """A copy of all but the open rollout."""
         state = {
             "agents": {name: a.state_dict() for name, a in self.agents.items()},
-            "inputs": self.inputs.state_dict(),
+            "inputs": self.inputs.norms.state_dict(),
             "normalizer": self.normalizer.state_dict(),
             "generator": self.generator.get_state(),
             "updates": self._updates,
             "dropped": self.num_dropped,
         }
-        return copy.deepcopy(state)
+        return snapshot(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict``; the rollout begins anew.
@@ -335,25 +273,38 @@ class PPOLearner:
                 f"{', '.join(self.agents)}: an override changed algo.kind or "
                 "algo.groups. Resume without it, or start a new run."
             )
-        state = copy.deepcopy(state)  # Adam keeps the very tensors it is given
+        state = snapshot(state)  # Adam keeps the very tensors it is given
         for name, agent in self.agents.items():
             agent.load_state_dict(state["agents"][name])
-        self.inputs.load_state_dict(state["inputs"])
+        self.inputs.norms.load_state_dict(state["inputs"])
         self.normalizer.load_state_dict(state["normalizer"])
         restore_generator(self.generator, state["generator"])
         self._updates = state["updates"]
         self._dropped.fill_(state["dropped"])
         self._rollout.clear()
 
+    @classmethod
+    def gentler(cls, config: AlgoConfig) -> str:
+        """See ``Learner.gentler``."""
+        return f"algo.ppo.lr={config.ppo.lr / 2:g}"
 
-def make_ppo(
-    config: AlgoConfig, inputs: PPOInputs, action_dim: int, generator: torch.Generator
-) -> PPO:
+    @classmethod
+    def row_count(cls, config: AlgoConfig, num_envs: int) -> int:
+        """Rows of a rollout."""
+        return num_envs * config.ppo.horizon
+
+    @classmethod
+    def batch_rows(cls, config: AlgoConfig, num_envs: int) -> int:
+        """Rows of a minibatch."""
+        return -(-cls.row_count(config, num_envs) // config.ppo.minibatches)
+
+
+def make_ppo(config: AlgoConfig, rows: HandRows, generator: torch.Generator) -> PPO:
     """Networks, loss and optimiser of one group."""
-    ppo, width, shape = config.ppo, inputs.observation_dim, inputs.future_shape
+    ppo, width, shape = config.ppo, rows.observation_dim, rows.future_shape
     policy = GaussianPolicy(
         width,
-        action_dim,
+        rows.action_dim,
         hidden=ppo.hidden,
         init_std=ppo.init_std,
         encoder=make_encoder(config, shape, 1),

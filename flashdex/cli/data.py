@@ -139,10 +139,10 @@ def _list_recordings(order: Order) -> int:
 def _baselines(args: argparse.Namespace) -> int:
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.baselines import format_baselines, score_baselines
-    from flashdex.training.build import open_workbench
+    from flashdex.training.build import RunBuilder
 
     recipe = compose(args.recipe, args.overrides)
-    bench = open_workbench(expect_kind(recipe, Recipe, where="baselines"))
+    bench = RunBuilder.from_recipe(expect_kind(recipe, Recipe, where="baselines"))
     if args.out is not None:
         args.out.unlink(missing_ok=True)  # scores of another time are no answer
     print(format_baselines(score_baselines(bench, args.out)))

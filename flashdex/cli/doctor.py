@@ -78,6 +78,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     Raises:
         FlashdexError: the recipe has mistakes or trains no motions.
     """
+    from flashdex.algorithms import find_algorithm
     from flashdex.cli.memory_report import format_cards, format_plan, format_work
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.build import learner_device
@@ -93,7 +94,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
         recipe, device="gpu" if on_gpu else "host", run_dir=default_run_dir(recipe)
     )
     parts = [format_plan(plan)]
-    if plan.sizes.row_bytes:
+    if find_algorithm(recipe.algo.kind).has_replay:
         parts += [format_cards(plan)] * on_gpu + [format_work(plan)]
     return "\n\n".join(parts), plan.fits and not (on_gpu and plan.machine.gpu is None)
 

@@ -194,12 +194,12 @@ def _validate(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace) -> int:
     from flashdex.recipe import compose, compose_runs, dump_recipe
-    from flashdex.training.any_run import resume, stored_recipe, train
+    from flashdex.training.run_dir import load_run_recipe, resume, train
 
     if args.resume is not None:
         words = [args.recipe, *args.overrides] if args.recipe else args.overrides
         if args.cfg:
-            print(dump_recipe(stored_recipe(args.resume, words)), end="")
+            print(dump_recipe(load_run_recipe(args.resume, words)), end="")
         else:
             _show_run(resume(args.resume, words))
         return 0
@@ -231,18 +231,14 @@ def _show_run(run_dir: Path) -> bool:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from flashdex.recipe import task_of_run
-
-    if task_of_run(args.run_dir) == "gym":
-        from flashdex.training.gym_run import evaluate_gym
-
-        print(json.dumps(evaluate_gym(args.run_dir, args.overrides), indent=1))
-        return 0
     from flashdex.reports.run.terminal import evaluation_table
-    from flashdex.training.evaluate import evaluate
+    from flashdex.training.run_dir import evaluate
 
     found = evaluate(args.run_dir, args.overrides)
-    print(evaluation_table(found.rows, found.totals))
+    if "motions" in found:
+        print(evaluation_table(found["motions"], found["totals"]))
+    else:
+        print(json.dumps(found, indent=1))
     return 0
 
 

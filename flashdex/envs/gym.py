@@ -1,55 +1,37 @@
-"""Stock Gymnasium environments as worlds of float32 tensors."""
+"""Stock Gymnasium environments as a batched TorchRL environment of float32 tensors."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
+from torch import Size, Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
 
+from flashdex import keys
 from flashdex.envs.config import GymConfig
+from flashdex.envs.tracking import FLAGS
 from flashdex.errors import FlashdexError, MissingExtraError
 
 
-@dataclass(frozen=True)
-class GymStep:
-    """What one vector step yields, before any reset.
-
-    Attributes:
-        observation: after the step, the last one of an episode included, (N, D).
-        reward: (N, 1).
-        terminated: the environment ended the episode, (N, 1) bool.
-        truncated: the step limit did, and nothing else, (N, 1) bool; set also where
-            the observation is not finite, from which nothing could go on.
-    """
-
-    observation: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-
-    @property
-    def done(self) -> Tensor:
-        """Either end of an episode, (N, 1) bool."""
-        return self.terminated | self.truncated
-
-
-class GymWorlds:
+class GymEnv(EnvBase):
     """N copies of one environment, stepped in this process.
 
     Nothing is reset on its own, so that the observation of a step is the true one also
-    where an episode ends.
+    where an episode ends. ``truncated`` is the step limit and nothing else; it is set
+    also where the observation is not finite, from which nothing could go on.
 
     Args:
         config: names the environment.
         num_envs: worlds N.
-        seed: of their starts; world i takes ``seed + i``.
+        seed: of their starts; world i takes ``seed + i``, at every reset of all.
 
     Raises:
         FlashdexError: the environment does not exist, cannot be made, has other than
@@ -57,13 +39,23 @@ class GymWorlds:
         MissingExtraError: gymnasium is not installed.
     """
 
+    is_host_device = True
+
     def __init__(self, config: GymConfig, *, num_envs: int, seed: int) -> None:
+        super().__init__(device=torch.device("cpu"), batch_size=Size([num_envs]))
         self.num_envs, self.seed = num_envs, seed
         self._env = _make_vector_env(config, num_envs)
         self._check_spaces(config)
         self._check_limit(config)
         self.observation_dim: int = self._env.single_observation_space.shape[0]
         self.action_dim: int = self._env.single_action_space.shape[0]
+        n = num_envs
+        observed = Unbounded(Size((n, self.observation_dim)))
+        self.observation_spec = Composite({keys.OBSERVATION: observed}, shape=(n,))
+        self.action_spec = Bounded(-1.0, 1.0, Size((n, self.action_dim)))
+        self.reward_spec = Unbounded(Size((n, 1)))
+        flags = {name: Binary(1, Size((n, 1)), dtype=torch.bool) for name in FLAGS}
+        self.full_done_spec = Composite(flags, shape=(n,))
 
     def _check_spaces(self, config: GymConfig) -> None:
         seen, acted = self._env.single_observation_space, self._env.single_action_space
@@ -88,45 +80,60 @@ class GymWorlds:
                 "gym.max_episode_steps=1000, say."
             )
 
-    def reset(self) -> Tensor:
-        """Start every world from its seed; observations, (N, D)."""
+    def _set_seed(self, seed: int | None) -> None:
+        self.seed = 0 if seed is None else seed
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        asked = None if tensordict is None else tensordict.get("_reset", None)
+        if asked is not None:
+            return self.reset_worlds(asked.reshape(self.num_envs))
         observation, _ = self._env.reset(seed=self.seed)
-        return _tensor(observation)
+        return self._root(observation)
 
-    @torch.no_grad()
-    def step(self, action: Tensor) -> GymStep:
-        """Step every world.
-
-        Args:
-            action: (N, A) in [-1, 1].
-        """
-        observation, reward, terminated, truncated, _ = self._env.step(action.numpy())
-        ended, seen = _column(terminated), _tensor(observation)
-        lost = ~seen.isfinite().all(-1, keepdim=True)
-        return GymStep(
-            observation=seen,
-            reward=_tensor(reward).unsqueeze(-1),
-            terminated=ended,
-            # An environment may fail in the very step that reaches the limit.
-            truncated=(_column(truncated) | lost) & ~ended,
-        )
-
-    def reset_done(self, done: Tensor) -> Tensor:
-        """Restart the worlds whose episode ended.
+    def reset_worlds(self, mask: Tensor) -> TensorDict:
+        """Begin new episodes in some worlds.
 
         Args:
-            done: (N, 1) bool, at least one of them true.
+            mask: worlds to reset, (N,) bool, at least one of them true.
 
         Returns:
-            Observations of all worlds, (N, D).
+            Observation and flags of all worlds, batch (N,).
         """
-        mask = done.squeeze(-1).numpy()
-        observation, _ = self._env.reset(options={"reset_mask": mask})
-        return _tensor(observation)
+        observation, _ = self._env.reset(options={"reset_mask": mask.numpy()})
+        return self._root(observation)
 
-    def close(self) -> None:
+    def _root(self, observation: np.ndarray) -> TensorDict:
+        flags = self.full_done_spec.zero()
+        return TensorDict(
+            {keys.OBSERVATION: _tensor(observation), **flags}, self.batch_size
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict[keys.ACTION].detach().numpy()
+        observation, reward, terminated, truncated, _ = self._env.step(action)
+        ended, seen = _column(terminated), _tensor(observation)
+        lost = ~seen.isfinite().all(-1, keepdim=True)
+        # An environment may fail in the very step that reaches the limit.
+        cut = (_column(truncated) | lost) & ~ended
+        step = {
+            keys.OBSERVATION: seen,
+            keys.REWARD: _tensor(reward).unsqueeze(-1),
+            keys.TERMINATED: ended,
+            keys.TRUNCATED: cut,
+            keys.DONE: ended | cut,
+        }
+        return TensorDict(step, self.batch_size)
+
+    def put_action(self, td: TensorDictBase, action: Tensor) -> None:
+        """Write actions (N, A) in [-1, 1] into ``td``."""
+        td.set(keys.ACTION, action)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the worlds."""
         self._env.close()
+        super().close(raise_if_closed=raise_if_closed)
 
 
 def _make_vector_env(config: GymConfig, num_envs: int) -> Any:

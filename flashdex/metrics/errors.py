@@ -88,9 +88,7 @@ class TrackingErrors:
     num_frames: int  # T
     num_ref_frames: int  # T_ref, of the whole reference
     fps: float  # control rate, Hz
-    missing: Mapping[str, str] = field(
-        default_factory=dict
-    )  # error -> absent key
+    missing: Mapping[str, str] = field(default_factory=dict)  # error -> absent key
     overflow: bool = False  # the engine dropped contacts or constraints
 
     @property

@@ -65,9 +65,8 @@ class FlashPolicy(TensorDictModuleBase):
         if exploration_type() == ExplorationType.RANDOM:
             noise = self.noise(tuple(mean.shape)).to(mean.dtype)
             if self.deterministic_key is not None:
-                noise = noise.masked_fill(
-                    tensordict.get(self.deterministic_key).reshape(-1, 1), 0
-                )
+                flag = tensordict.get(self.deterministic_key)
+                noise = noise.masked_fill(flag.reshape(-1, 1), 0)
             mean = mean + std * noise
         action = torch.tanh(mean)
         for key, value in zip(self.out_keys, action.unbind(0), strict=True):

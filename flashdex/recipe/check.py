@@ -12,6 +12,8 @@ import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
+from flashdex.algorithms.base import config_class
+from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.mdp.term import KINDS, Kind, find_term, registry
 from flashdex.errors import FlashdexError, RecipeError, nearest
 from flashdex.recipe.schema import RunRecipe
@@ -163,7 +165,10 @@ def _convert(
     if origin is list:
         return _convert_list(args[0], value, path, problems)
     if dataclasses.is_dataclass(hint):
-        return _read_dataclass(typing.cast(type, hint), value, path, problems), None
+        cls = typing.cast(type, hint)
+        if cls is AlgoConfig and isinstance(value, Mapping):
+            cls = config_class(value.get("kind"))  # an algorithm may add keys
+        return _read_dataclass(cls, value, path, problems), None
     return _convert_scalar(hint, value)
 
 

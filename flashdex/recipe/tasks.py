@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
+from flashdex.algorithms import find_algorithm, known_algorithms
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.envs.mdp.term import KINDS as TERM_KINDS
@@ -22,7 +23,7 @@ from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 
 def find_conflicts(recipe: Recipe) -> list[str]:
     """Return one line for each thing that does not fit together."""
-    checks = (_hand, _motions, _rate, _replay, _algo, _env, _expect)
+    checks = (_hand, _motions, _rate, _algo, _env, _expect)
     return [problem for check in checks for problem in check(recipe)]
 
 
@@ -60,64 +61,29 @@ def _rate(recipe: Recipe) -> list[str]:
     ]
 
 
-def _replay(recipe: Recipe) -> list[str]:
-    return replay_conflicts(
-        recipe.algo,
-        total_env_steps=recipe.total_env_steps,
-        num_envs=recipe.env.num_envs,
-        where="env.num_envs",
-    )
+def _algo(recipe: Recipe) -> list[str]:
+    return algo_conflicts(recipe, {"env.num_envs": recipe.env.num_envs})
 
 
-def replay_conflicts(
-    algo: AlgoConfig, *, total_env_steps: int, num_envs: int, where: str
-) -> list[str]:
-    """Return what does not fit between replay buffer, budget and worlds.
+def algo_conflicts(recipe: Recipe | GymRecipe, worlds: dict[str, int]) -> list[str]:
+    """Return what does not fit between algorithm, task, budget and worlds.
 
     Args:
-        algo: sizes of the buffer.
-        total_env_steps: budget.
-        num_envs: worlds.
-        where: key that gives the worlds, for the message.
+        recipe: of either kind.
+        worlds: their number, by the recipe key that gives it.
     """
-    if algo.kind == "ppo":
-        return []  # no replay
-    problems = []
-    if algo.min_buffer > algo.buffer_size:
-        problems.append(
-            f"algo.min_buffer: {algo.min_buffer} rows never fit in algo.buffer_size="
-            f"{algo.buffer_size}; learning would not start"
-        )
-    if algo.min_buffer >= total_env_steps > 1:
-        problems.append(
-            f"algo.min_buffer: {algo.min_buffer} rows of random actions use up "
-            f"total_env_steps={total_env_steps}"
-        )
-    # The newest n steps of every world have no complete return yet.
-    if algo.buffer_size <= num_envs * algo.n_step:
-        problems.append(
-            f"algo.buffer_size: {algo.buffer_size} must exceed {where} x "
-            f"algo.n_step = {num_envs * algo.n_step}"
-        )
-    return problems
-
-
-def _algo(recipe: Recipe) -> list[str]:
-    algo = recipe.algo
-    problems = rate_conflicts(algo)
-    if len(algo.future_channels) != 3 or min(algo.future_channels) < 1:
-        problems.append(
-            f"algo.future_channels: expected three positive numbers, found "
-            f"{algo.future_channels}"
-        )
-    return problems
-
-
-def rate_conflicts(algo: AlgoConfig) -> list[str]:
-    """Return what does not fit between the learning rates."""
-    if algo.lr_final > algo.lr:
-        return [f"algo.lr_final: {algo.lr_final} is above algo.lr={algo.lr}"]
-    return []
+    algo, task = recipe.algo, recipe.task
+    try:
+        learner = find_algorithm(algo.kind)
+    except FlashdexError as error:
+        return [str(error)]
+    if task not in learner.tasks:
+        able = [name for name, a in known_algorithms().items() if task in a.tasks]
+        return [
+            f"algo.kind: '{algo.kind}' is not available with task: {task}; use "
+            f"{' or '.join(able)}"
+        ]
+    return learner.conflicts(algo, recipe.total_env_steps, worlds)
 
 
 def _env(recipe: Recipe) -> list[str]:
@@ -203,13 +169,7 @@ def find_gym_conflicts(recipe: GymRecipe) -> list[str]:
     return [
         *_environment(recipe),
         *_hand_keys(recipe.algo),
-        *replay_conflicts(
-            recipe.algo,
-            total_env_steps=recipe.total_env_steps,
-            num_envs=recipe.gym.num_envs,
-            where="gym.num_envs",
-        ),
-        *rate_conflicts(recipe.algo),
+        *algo_conflicts(recipe, {"gym.num_envs": recipe.gym.num_envs}),
         *expect_conflicts(recipe.expect),
     ]
 
@@ -234,12 +194,7 @@ def _environment(recipe: GymRecipe) -> list[str]:
 
 def _hand_keys(algo: AlgoConfig) -> list[str]:
     plain = AlgoConfig()
-    problems = []
-    if algo.kind != "flashsac":
-        problems.append(
-            f"algo.kind: '{algo.kind}' is not available with task: gym; use flashsac"
-        )
-    return problems + [
+    return [
         f"algo.{key}: has no effect with task: gym, which has neither hands nor a "
         "future window; leave it out"
         for key in HAND_ONLY

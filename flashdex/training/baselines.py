@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from torch import Tensor
 
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.criteria import criterion_names, score
+from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import frozen_object
 from flashdex.rollouts.build import grace_steps
 from flashdex.system.files import write_atomic
-from flashdex.training.build import Workbench
+from flashdex.training.build import RunBuilder
 from flashdex.training.evaluator import roll_all
 
 
@@ -55,42 +57,28 @@ def follow_reference(env: TrackingEnv) -> Tensor:
 BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}
 
 
-def score_baselines(bench: Workbench, path: Path | None = None) -> Baselines:
-    """Roll and score all baselines on all motions; reuse the file of this run.
-
-    Args:
-        bench: motions and recipe.
-        path: JSON file that keeps the result.
-    """
+def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
+    """Roll and score all baselines on all motions; reuse the file of this run."""
     if path is not None and path.is_file():
         return Baselines(json.loads(path.read_text(encoding="utf-8")))
-    joints = bench.bank.num_joints
+    joints = builder.bank.num_joints
 
     def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
         return torch.zeros(env.num_envs, 2, joints, device=env.device)
 
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     for name, target in BASELINES.items():
-        criterion = bench.recipe.train.criterion
-        rows[name] = {}
-        for rollout in roll_all(bench, idle, target=target):
-            verdicts = rollout.score()
-            verdict = verdicts[criterion]
-            rows[name][rollout.motion] = {
-                "passed": [k for k, v in verdicts.items() if v.is_passed],
-                "state": verdict.state,
-                "errors": {k: round(v, 5) for k, v in verdict.values.items()},
-            }
-    rows["frozen_object"] = _score_frozen(bench)
+        rollouts = roll_all(builder, idle, target=target)
+        rows[name] = {r.motion: _row(builder, r.score()) for r in rollouts}
+    rows["frozen_object"] = _score_frozen(builder)
     if path is not None:
         write_atomic(path, json.dumps(rows, indent=1))
     return Baselines(rows)
 
 
-def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
+def _score_frozen(builder: RunBuilder) -> dict[str, dict[str, Any]]:
     """``frozen_object``: objects stay at their first reference pose."""
-    bank = bench.bank_on(torch.device("cpu"))
-    criterion = bench.recipe.train.criterion
+    bank = builder.bank_on(torch.device("cpu"))
     out: dict[str, dict[str, Any]] = {}
     for row, name in enumerate(bank.names):
         frames = torch.arange(int(bank.length[row]))
@@ -103,22 +91,22 @@ def _score_frozen(bench: Workbench) -> dict[str, dict[str, Any]]:
             hand_object=slots.tolist(),
             fps=bank.fps,
         )
-        verdicts = score(errors, grace=grace_steps(bank.fps))
-        verdict = verdicts[criterion]
-        out[name] = {
-            "passed": [k for k, v in verdicts.items() if v.is_passed],
-            "state": verdict.state,
-            "errors": {k: round(v, 5) for k, v in verdict.values.items()},
-        }
+        out[name] = _row(builder, score(errors, grace=grace_steps(bank.fps)))
     return out
 
 
-def format_baselines(baselines: Baselines) -> str:
-    """A table: how many motions each baseline passes, by criterion.
+def _row(builder: RunBuilder, verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
+    """Scores of one motion."""
+    verdict = verdicts[builder.recipe.train.criterion]
+    return {
+        "passed": [k for k, v in verdicts.items() if v.is_passed],
+        "state": verdict.state,
+        "errors": {k: round(v, 5) for k, v in verdict.values.items()},
+    }
 
-    Args:
-        baselines: from ``score_baselines``.
-    """
+
+def format_baselines(baselines: Baselines) -> str:
+    """A table: how many motions each baseline passes, by criterion."""
     names = list(baselines.rows)
     total = len(next(iter(baselines.rows.values())))
     lines = [

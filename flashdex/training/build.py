@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.algorithms.base import Learner
-from flashdex.algorithms.flashsac import FlashSACLearner
-from flashdex.algorithms.ppo import PPOLearner
+from flashdex.algorithms import find_algorithm
+from flashdex.algorithms.base import Learner, TaskSpec
 from flashdex.datasets.source import SourceOptions
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
@@ -36,12 +35,11 @@ from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
 from flashdex.system.machine import versions
 
+_LOG = logging.getLogger(__name__)
+
 
 def load_library(recipe: Recipe) -> MotionLibrary:
     """Load the library of a recipe; prepare it where there is none or it is old.
-
-    Args:
-        recipe: validated recipe.
 
     Raises:
         FlashdexError: it names no motions, or they cannot be read.
@@ -147,12 +145,9 @@ def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
     )
 
 
-_LOG = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
-class Workbench:
-    """What every use of a recipe needs.
+class RunBuilder:
+    """Builds the parts of a run: environment, learner, rollouts.
 
     Attributes:
         recipe: validated recipe.
@@ -166,6 +161,36 @@ class Workbench:
     hands: dict[keys.Side, HandSpec]
     bank: ReferenceBank
 
+    @classmethod
+    def from_recipe(
+        cls, recipe: Recipe, *, device: torch.device | None = None
+    ) -> RunBuilder:
+        """Load or prepare the motions of a recipe and check that they fit it.
+
+        Raises:
+            LibraryError: the library is missing, of another hand or of another rate.
+        """
+        hands = load_hand(recipe.hand)
+        library = select_motions(load_library(recipe), recipe)
+        if library.hand != recipe.hand:
+            raise LibraryError(
+                f"{library.path}: prepared for hand '{library.hand}', the recipe asks "
+                f"for '{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
+            )
+        step_dt = recipe.physics.timestep * recipe.physics.decimation
+        if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):
+            decimation = round(1 / (library.fps * recipe.physics.timestep))
+            raise LibraryError(
+                f"{library.path}: {library.fps:g} frames a second, but "
+                f"physics.timestep x physics.decimation gives {1 / step_dt:g} control "
+                f"steps a second. Set physics.decimation={decimation} or prepare with "
+                f"--hz {1 / step_dt:g}."
+            )
+        if device is None:  # else somebody who steps no physics
+            check_engine(library, recipe.physics)
+            device = engine_device(recipe.physics)
+        return cls(recipe, library, hands, ReferenceBank(library, hands).to(device))
+
     @property
     def step_dt(self) -> float:
         """Control step, s."""
@@ -178,13 +203,7 @@ class Workbench:
         seed: int | None = None,
         evaluation: bool = False,
     ) -> TrackingEnv:
-        """Build physics and environment.
-
-        Args:
-            num_envs: worlds; the recipe's number when None.
-            seed: of resets; the recipe's when None.
-            evaluation: no terminations, no noise, every world an attempt.
-        """
+        """Build physics and environment, as the recipe says where None."""
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
         physics = make_physics(self.library, self.hands, recipe.physics, count)
@@ -212,14 +231,7 @@ class Workbench:
         made_by: dict[str, Any] | None = None,
         provenance: dict[str, str] | None = None,
     ) -> RolloutBuilder:
-        """Build what turns episodes into rollouts.
-
-        Args:
-            scenes: of all motions.
-            made_by: engine, versions and hardware of the states; this machine's, when
-                None.
-            provenance: stored with every rollout.
-        """
+        """Build what turns episodes into rollouts."""
         recipe, device = self.recipe, self.bank.table.device
         return RolloutBuilder(
             self.bank_on(torch.device("cpu")),
@@ -241,7 +253,7 @@ class Workbench:
         return lead
 
     def make_learner(self, env: TrackingEnv) -> Learner:
-        """Build networks, loss and replay for an environment's states.
+        """Build the recipe's algorithm for an environment's states.
 
         Raises:
             FlashdexError: the recipe asks for a device that is not there.
@@ -254,28 +266,20 @@ class Workbench:
             self.hands,
             reference_offset=recipe.env.reference_offset,
         )
-        algo, example = recipe.algo, env.reset().to(device)
-        if algo.kind == "ppo":
-            return PPOLearner(
-                algo, transforms, bank, example, seed=recipe.seed, device=device
-            )
-        steps = recipe.total_env_steps / env.num_envs
-        return FlashSACLearner(
-            algo,
-            transforms,
-            bank,
-            example,
-            total_updates=max(1, math.ceil(steps * algo.updates_per_step)),
+        spec = TaskSpec(
+            example=env.reset().to(device),
+            action_dim=bank.num_joints,
+            vector_steps=recipe.total_env_steps / env.num_envs,
             seed=recipe.seed,
             device=device,
+            bank=bank,
+            transforms=transforms,
         )
+        return find_algorithm(recipe.algo.kind)(recipe.algo, spec)
 
 
 def learner_device(recipe: Recipe) -> torch.device:
-    """Where a recipe learns.
-
-    Args:
-        recipe: ``algo.device`` names it; auto is a GPU where there is one.
+    """Where a recipe learns; ``algo.device=auto`` is a GPU where there is one.
 
     Raises:
         FlashdexError: it asks for a GPU, and torch sees none.
@@ -289,35 +293,3 @@ def learner_device(recipe: Recipe) -> torch.device:
     if wanted == "cpu" or not there:
         return torch.device("cpu")
     return torch.device("cuda", torch.cuda.current_device())
-
-
-def open_workbench(recipe: Recipe, *, device: torch.device | None = None) -> Workbench:
-    """Load or prepare the motions of a recipe and check that they fit it.
-
-    Args:
-        recipe: validated recipe.
-        device: of the bank; that of the physics when None.
-
-    Raises:
-        LibraryError: the library is missing, of another hand or of another rate.
-    """
-    hands = load_hand(recipe.hand)
-    library = select_motions(load_library(recipe), recipe)
-    if library.hand != recipe.hand:
-        raise LibraryError(
-            f"{library.path}: prepared for hand '{library.hand}', the recipe asks for "
-            f"'{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
-        )
-    step_dt = recipe.physics.timestep * recipe.physics.decimation
-    if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):
-        raise LibraryError(
-            f"{library.path}: {library.fps:g} frames a second, but physics.timestep x "
-            f"physics.decimation gives {1 / step_dt:g} control steps a second. Set "
-            f"physics.decimation={round(1 / (library.fps * recipe.physics.timestep))} "
-            f"or prepare with --hz {1 / step_dt:g}."
-        )
-    if device is None:  # else somebody who steps no physics
-        check_engine(library, recipe.physics)
-        device = engine_device(recipe.physics)
-    bank = ReferenceBank(library, hands).to(device)
-    return Workbench(recipe, library, hands, bank)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from flashdex.errors import RunError
-from flashdex.replay.disk import FOLDER
+from flashdex.replay.disk import FOLDER, ReplayLog
 from flashdex.system.files import open_atomic
-
-if TYPE_CHECKING:
-    from flashdex.replay.disk import ReplayLog
 
 _LOG = logging.getLogger(__name__)
 FORMAT = 2  # raised whenever older code could misread a checkpoint
@@ -46,7 +43,7 @@ def save_checkpoint(
 
     Args:
         run_dir: run directory.
-        state: tensors and plain Python values only; ``env_steps`` names the file.
+        state: tensors and plain values; ``env_steps`` names the file.
         keep: newest checkpoints that stay.
         replay: rows to store beside it.
 
@@ -79,10 +76,6 @@ def load_checkpoint(
     One that cannot (a full or failing disk) is named in a warning, and the one before
     is taken.
 
-    Args:
-        run_dir: run directory.
-        needs: keys the caller reads, `EVALUATED` or `RESUMED` say.
-
     Raises:
         RunError: there is none, none can be read, another version wrote it, or a key
             is missing.
@@ -98,7 +91,8 @@ def load_checkpoint(
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:
-            faults.append(f"{path.name}: {_first_line(error)}")
+            what = (str(error).strip() or type(error).__name__).splitlines()[0]
+            faults.append(f"{path.name}: {what}")
             _LOG.warning("%s cannot be read, trying the one before", path)
             continue
         check_format(state, path, needs)
@@ -111,11 +105,6 @@ def load_checkpoint(
 
 def check_format(state: Any, path: Path, needs: Collection[str] = ()) -> None:
     """Refuse a checkpoint of another version, or one without what is needed.
-
-    Args:
-        state: what the file holds.
-        path: the file, for the message.
-        needs: keys that must be there.
 
     Raises:
         RunError: the format is another one, or a key is missing.
@@ -159,10 +148,6 @@ def set_aside_newer(run_dir: Path, env_steps: int) -> None:
 
     Only unreadable ones do. Under their name they would be tried first at every resume
     and rotate good ones out.
-
-    Args:
-        run_dir: run directory.
-        env_steps: counter of the checkpoint that was read.
     """
     for path in _newest_first(run_dir):
         if int(path.stem) > env_steps:
@@ -178,7 +163,3 @@ def remove_temporaries(run_dir: Path) -> None:
 def _newest_first(run_dir: Path) -> list[Path]:
     found = (run_dir / FOLDER).glob("*.pt")
     return sorted((p for p in found if p.stem.isdigit()), reverse=True)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,30 +1,29 @@
-"""Full-length rollouts of every motion under a given controller."""
+"""Every motion once from frame 0: rollouts under a controller, and their scores."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex import keys
 from flashdex.algorithms.base import Learner
-from flashdex.envs.gym import GymWorlds
 from flashdex.envs.tracking import TrackingEnv
-from flashdex.recipe import GymRecipe
+from flashdex.metrics.aggregate import mean_object_errors, mope_more
 from flashdex.rollouts.recorder import EpisodeRecorder
 from flashdex.rollouts.rollout import Rollout
-from flashdex.training.build import Workbench
+from flashdex.training.build import RunBuilder
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]
 """State and environment to actions (N, 2, J)."""
+SHOWN = ("sr_mt_obj", "sr_mt", "sr_spider_raw", "sr_spider_centred")
 
 
 def roll_all(
-    bench: Workbench,
+    builder: RunBuilder,
     controller: Controller,
     *,
     env_steps: int = 0,
@@ -34,7 +33,7 @@ def roll_all(
     """Roll every motion once from frame 0, without assist, noise or terminations.
 
     Args:
-        bench: motions and recipe.
+        builder: motions and recipe.
         controller: what acts.
         env_steps: counter stored with the rollouts.
         worlds: motions rolled side by side.
@@ -44,27 +43,27 @@ def roll_all(
     Returns:
         One rollout a motion, in library order.
     """
-    total = bench.bank.num_motions
+    total = builder.bank.num_motions
     out: list[Rollout] = []
     for first in range(0, total, worlds):
         rows = torch.arange(first, min(first + worlds, total))
-        out += _roll(bench, controller, rows, env_steps, target)
+        out += _roll(builder, controller, rows, env_steps, target)
     return out
 
 
 @torch.no_grad()
 def _roll(
-    bench: Workbench,
+    builder: RunBuilder,
     controller: Controller,
     rows: Tensor,
     env_steps: int,
     target: Callable[[TrackingEnv], Tensor] | None,
 ) -> list[Rollout]:
-    env = bench.make_env(num_envs=len(rows), evaluation=True)
+    env = builder.make_env(num_envs=len(rows), evaluation=True)
     env.forced_motion = rows.to(env.device)
     env.target_override = target
     recorder = EpisodeRecorder(env, look_every=1)
-    builder = bench.rollout_builder(env.physics.scenes)
+    rollouts = builder.rollout_builder(env.physics.scenes)
     td = env.reset()
     recorder.record_start()
     found: dict[int, Rollout] = {}
@@ -74,110 +73,43 @@ def _roll(
         done = env.step(td)["next", keys.DONE]
         for episode in recorder.record_step(action, done, env_steps):
             if episode.motion not in found:  # short motions begin again
-                found[episode.motion] = builder.build(episode)
+                found[episode.motion] = rollouts.build(episode)
         td = env.reset_worlds(done.squeeze(-1))
         recorder.record_start()
     return [found[r] for r in rows.tolist()]
 
 
-_LOG = logging.getLogger(__name__)
-# Keeps the starts of evaluations apart from those of training. A resumed run begins at
-# its seed plus its env steps, so the offset is one that no budget reaches.
-SEED_OFFSET = 2**30
+def evaluate_motions(
+    builder: RunBuilder, learner: Learner, *, env_steps: int
+) -> dict[str, Any]:
+    """Roll every motion from frame 0, deterministic, no assist, no terminations.
 
-
-class StoppedError(Exception):
-    """An evaluation was told to end before its episodes did."""
-
-
-@dataclass(frozen=True)
-class GymEvaluation:
-    """One episode of each world.
-
-    Attributes:
-        returns: undiscounted sums of raw rewards, (E,); those not finite count as 0.
-        lengths: steps, (E,).
+    Returns:
+        ``totals``, rates and mean errors of the collection, and ``motions``, for each
+        its name, the state of each verdict and its errors.
     """
 
-    returns: Tensor
-    lengths: Tensor
+    def act(td: TensorDictBase, env: TrackingEnv) -> Tensor:
+        return learner.act(td.to(learner.device), explore=False)
 
-    def metrics(self) -> dict[str, float]:
-        """What is logged of an evaluation."""
-        return {
-            "eval/return": self.returns.mean().item(),
-            "eval/return_std": self.returns.std(correction=0).item(),
-            "eval/return_min": self.returns.min().item(),
-            "eval/return_max": self.returns.max().item(),
-            "eval/length": self.lengths.float().mean().item(),
-            "eval/episodes": float(len(self.returns)),
+    criterion = builder.recipe.train.criterion
+    names = list(dict.fromkeys([criterion, *SHOWN]))
+    rows, errors = [], []
+    for rollout in roll_all(builder, act, env_steps=env_steps):
+        verdicts = rollout.score()
+        values = verdicts[criterion].values.items()
+        row = {
+            "motion": rollout.motion,
+            **{name: verdicts[name].state for name in names},
+            "errors": {k: round(v, 5) for k, v in values},
         }
-
-
-def observed(observation: Tensor) -> TensorDict:
-    """The state a learner reads: a TensorDict (N,) with the observation (N, D)."""
-    return TensorDict({keys.OBSERVATION: observation}, [len(observation)])
-
-
-def evaluate_recipe(
-    recipe: GymRecipe,
-    learner: Learner,
-    *,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> GymEvaluation:
-    """Play the evaluation episodes of a recipe: the same starts at every call.
-
-    Args:
-        recipe: names the environment and the number of episodes.
-        learner: acts; neither its noise nor its statistics move.
-        should_stop: asked before every vector step.
-
-    Raises:
-        StoppedError: ``should_stop`` said so.
-    """
-    config = recipe.gym
-    worlds = GymWorlds(
-        config, num_envs=config.eval_episodes, seed=recipe.seed + SEED_OFFSET
-    )
-    try:
-        return evaluate_policy(learner, worlds, should_stop=should_stop)
-    finally:
-        worlds.close()
-
-
-def evaluate_policy(
-    learner: Learner,
-    worlds: GymWorlds,
-    *,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> GymEvaluation:
-    """Play one episode in each world from its seed, without exploration.
-
-    Args:
-        learner: acts; neither its noise nor its statistics move.
-        worlds: one an episode, of a limited length.
-        should_stop: asked before every vector step.
-
-    Raises:
-        StoppedError: ``should_stop`` said so.
-    """
-    returns = torch.zeros(worlds.num_envs, 1, dtype=torch.float64)
-    lengths = torch.zeros(worlds.num_envs, 1, dtype=torch.int64)
-    alive = torch.ones(worlds.num_envs, 1, dtype=torch.bool)
-    bad = 0
-    observation = worlds.reset()
-    while alive.any():
-        if should_stop():
-            raise StoppedError
-        step = worlds.step(learner.act(observed(observation), explore=False))
-        finite = step.reward.isfinite()
-        bad += int((alive & ~finite).sum())
-        returns += torch.where(alive & finite, step.reward, 0.0)
-        lengths += alive
-        alive &= ~step.done
-        observation = step.observation
-        if step.done.any():  # worlds step together; a second episode does not count
-            observation = worlds.reset_done(step.done)
-    if bad:
-        _LOG.warning("%d rewards of the evaluation were not finite: taken as 0", bad)
-    return GymEvaluation(returns.squeeze(-1), lengths.squeeze(-1))
+        rows.append(row)
+        mean = mean_object_errors(rollout.tracking_errors())
+        errors.append((mean, verdicts["sr_spider_centred"]))
+    totals: dict[str, Any] = {"env_steps": env_steps, **mope_more(errors)}
+    for name in names:
+        states = [row[name] for row in rows]
+        totals[name] = {
+            s: states.count(s) for s in ("passed", "failed", "not_measured")
+        }
+    return {"totals": totals, "motions": rows}

@@ -1,11 +1,11 @@
-"""Numbers that are not finite: found before they reach rows, weights or checkpoints."""
+"""Numbers that are not finite: found before they spread, and dumped to be repeated."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,8 +14,13 @@ from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-if TYPE_CHECKING:
-    from flashdex.algorithms.base import Learner
+from flashdex.algorithms.base import Learner, snapshot
+from flashdex.errors import RunError
+from flashdex.recipe import dump_recipe
+from flashdex.system.files import open_atomic
+from flashdex.training.checkpoint import FORMAT, check_format, newest_checkpoint
+
+DUMP = "nan_dump.pt"  # everything to repeat the update that was not finite
 
 # Raw simulator states, which may hold anything once a world diverges.
 RAW = frozenset({"nstep"})
@@ -53,17 +58,13 @@ def numeric_errors(learner: Learner) -> Iterator[None]:
     The projection of a target indexes with what the networks say, and fails on NaN
     before there is any gradient.
 
-    Args:
-        learner: performs an update inside the block.
-
     Raises:
         NonFiniteError: an error came up, and its batch or its state is not finite.
     """
     try:
         yield
     except RuntimeError as error:
-        batch = getattr(learner, "last_update", None)
-        if first_non_finite([batch, learner.state_dict()]):
+        if first_non_finite([learner.last_update, learner.state_dict()]):
             raise NonFiniteError(str(error).splitlines()[0]) from error
         raise
 
@@ -88,12 +89,7 @@ class GradientGuard:
         self._handle = register_optimizer_step_pre_hook(self._look)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._handle.remove()
 
     @torch.no_grad()
@@ -126,3 +122,62 @@ def _describe(parameters: list[Tensor]) -> str:
         if p.grad is not None and not bool(p.grad.isfinite().all()):
             return f"gradient of parameter {number}, {tuple(p.shape)}"
     return "norm of the gradients"
+
+
+def stop_with_dump(
+    run_dir: Path,
+    what: str,
+    *,
+    recipe: Any,
+    learner: Learner,
+    env_steps: int,
+    metrics: dict[str, float] | None = None,
+) -> RunError:
+    """Write ``nan_dump.pt`` and return the error that says how to go on."""
+    state = snapshot(learner.state_dict())
+    update = snapshot(learner.last_update)
+    cause = _cause(what, state, update)
+    dump = {
+        "format": FORMAT,
+        "what": cause,
+        "env_steps": env_steps,
+        "updates": learner.updates,
+        "recipe": dump_recipe(recipe),
+        "learner": state,
+        "update": update,
+        "torch_rng": torch.get_rng_state(),
+        "metrics": metrics or {},
+    }
+    where = f"The state and the batch are in {run_dir / DUMP}."
+    try:
+        with open_atomic(run_dir / DUMP) as file:
+            torch.save(dump, file)
+    except (OSError, RuntimeError) as error:
+        where = f"The dump could not be written ({error})."
+    return RunError(
+        f"{run_dir}: not finite after {env_steps} env steps and {learner.updates} "
+        f"updates: {cause}. {where} No checkpoint was written over; the newest good "
+        f"one is {newest_checkpoint(run_dir)}. Go on from it with a smaller learning "
+        f"rate, say: flashdex train --resume {run_dir} "
+        f"{learner.gentler(recipe.algo)}. To repeat the update see 'NaN' in "
+        "docs/runs.md."
+    )
+
+
+def _cause(what: str, state: Any, update: Any) -> str:
+    """The earliest thing that is not finite: batch, then weights, then ``what``."""
+    for name, part in (("batch", (update or {}).get("batch")), ("state", state)):
+        found = first_non_finite(part) if part is not None else ""
+        if found:
+            return f"{name} entry '{found}'" + (f", then {what}" if what else "")
+    return what
+
+
+def read_dump(path: Path) -> dict[str, Any]:
+    """Read a dump as plain data."""
+    try:
+        dump = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise RunError(f"{path}: not a readable dump ({error}).") from error
+    check_format(dump, path)
+    return dump

@@ -6,23 +6,21 @@ import csv
 import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from flashdex.errors import FlashdexError
+from flashdex.recipe import RunRecipe
 from flashdex.system.files import write_atomic
 from flashdex.system.jsonl import drop_cut_line, keep_lines
-
-if TYPE_CHECKING:
-    from flashdex.recipe import RunRecipe
 
 METRICS = "metrics.jsonl"
 
 
 class MetricWriter(Protocol):
-    """Takes one record of metrics at a time."""
+    """Takes one record at a time; each holds ``env_steps``."""
 
     def write(self, record: dict[str, float]) -> None:
-        """Write one record; it always holds ``env_steps``."""
+        """Write one record."""
         ...
 
     def close(self) -> None:
@@ -45,48 +43,38 @@ class JsonlWriter:
         if env_steps is not None:
             keep_lines(path, lambda record: record["env_steps"] <= env_steps)
         self._file = path.open("a", encoding="utf-8")
+        self.close = self._file.close
 
     def write(self, record: dict[str, float]) -> None:
         """Append and flush."""
         self._file.write(json.dumps(record) + "\n")
         self._file.flush()
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
 
 class CsvWriter:
-    """Writes ``metrics.csv``; a new key adds a column, empty in the rows above.
-
-    Args:
-        run_dir: run directory.
-        env_steps: as for `JsonlWriter`.
-    """
+    """Writes ``metrics.csv``; a new key adds a column, empty in the rows above."""
 
     def __init__(self, run_dir: Path, *, env_steps: int | None = None) -> None:
         self._path = run_dir / "metrics.csv"
-        self._fields: list[str] = []
-        if not self._path.is_file():
-            return
         drop_cut_line(self._path)
-        with self._path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            self._fields = list(reader.fieldnames or [])
-            rows = list(reader)
+        self._fields, rows = self._read()
         if env_steps is not None:
             kept = [r for r in rows if float(r["env_steps"]) <= env_steps]
             if len(kept) < len(rows):
                 self._rewrite(kept)
 
+    def _read(self) -> tuple[list[str], list[dict[str, str]]]:
+        if not self._path.is_file():
+            return [], []
+        with self._path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            return list(reader.fieldnames or []), list(reader)
+
     def write(self, record: dict[str, float]) -> None:
         """Append one row."""
         fresh = [key for key in record if key not in self._fields]
         if fresh:
-            rows = []
-            if self._path.is_file():
-                with self._path.open(newline="", encoding="utf-8") as file:
-                    rows = list(csv.DictReader(file))
+            _, rows = self._read()
             self._fields += fresh
             self._rewrite(rows)
         with self._path.open("a", newline="", encoding="utf-8") as file:
@@ -104,13 +92,7 @@ class CsvWriter:
 
 
 class WandbWriter:
-    """Weights & Biases, on its own axes: env steps and hours, never W&B's step.
-
-    Args:
-        run_dir: run directory; offline files go there.
-        recipe: names, tags and mode.
-        run_id: id of an earlier session of the same run.
-    """
+    """Weights & Biases, on its own axes: env steps and hours, never W&B's step."""
 
     def __init__(
         self, run_dir: Path, recipe: RunRecipe, *, run_id: str | None = None
@@ -151,14 +133,7 @@ class WandbWriter:
 
 
 class MetricLog:
-    """Sends each record to all writers of the recipe.
-
-    Args:
-        run_dir: run directory.
-        recipe: names the writers.
-        wandb_id: id of an earlier session.
-        env_steps: of the checkpoint a resumed run goes on from; later records go.
-    """
+    """Sends each record to all writers of the recipe; see those for the arguments."""
 
     def __init__(
         self,

@@ -25,9 +25,9 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 from flashdex import keys
-from flashdex.algorithms.agent import make_actor, make_critic
 from flashdex.algorithms.base import Learner
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.flashsac import make_actor, make_critic
 from flashdex.envs.physics.cpu import CpuPhysics
 from flashdex.envs.physics.warp.memory import WarpMemory, measure_warp
 from flashdex.envs.reference import ReferenceBank
@@ -39,8 +39,8 @@ from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.recipe import Recipe
 from flashdex.replay.codec import row_bytes
 from flashdex.replay.disk import replay_of
-from flashdex.rollouts.recorder import AttemptRing
-from flashdex.training.build import Workbench
+from flashdex.rollouts.recorder import EpisodeRecorder
+from flashdex.training.build import RunBuilder
 from flashdex.training.stand_in import Collection, StandIn
 
 _WORLDS, _BATCH = 2, 32
@@ -182,7 +182,7 @@ def _ask_flashsac(
         with PeakMeter() as meter:
             batch = learner.sample(count)[0]
         peaks.append(meter.peak)
-    row, groups = batch[:1].to("meta"), learner.groups
+    row, groups = batch[:1].to("meta"), learner.rows.groups
     width, future = row[keys.OBSERVATION].shape[-1], row.get(keys.FUTURE, None)
     window = None if future is None else tuple(future.shape[1:])
     number = len(groups.names)
@@ -243,19 +243,19 @@ class Rehearsal:
         joints = self.hands["left"].num_joints
         self.library = StandIn.of(collection, joints=joints, hand=recipe.hand)
         self.bank = ReferenceBank(self.library, self.hands)
-        bench = Workbench(_small(recipe), self.library, self.hands, self.bank)
+        bench = RunBuilder(_small(recipe), self.library, self.hands, self.bank)
         env = bench.make_env()
         self._batch = cast(CpuPhysics, env.physics).batch
         self.model = env.physics.scenes[0].model
-        learner, self._ring = bench.make_learner(env), AttemptRing(env)
+        learner, self._ring = bench.make_learner(env), EpisodeRecorder(env)
         td: Any = env.rand_step(env.reset())
-        self._ring.begin()
+        self._ring.record_start()
         after, action = td["next"], torch.zeros(_WORLDS, 2, joints)
-        self._ring.step(action, after[keys.DONE], 0)
+        self._ring.record_step(action, after[keys.DONE], 0)
         flags, reward = (after[keys.TERMINATED], after[keys.DONE]), torch.zeros(2, 2)
         with _quiet(logging.getLogger("torchrl")):  # it tells of its buffer
             for _ in range(recipe.algo.n_step):
-                learner.remember(td, action, reward, after, flags[0], flags[1])
+                learner.process_step(td, action, reward, after, flags[0], flags[1])
         ends = [list(end.select(*keys.STATE).values(True, True)) for end in (td, after)]
         self.step_bytes = tensor_bytes([ends, action, reward, flags]) // _WORLDS
         """One step of one world before packing: states, action, reward, flags."""

@@ -1,27 +1,33 @@
-"""Sessions of a run: what a crash cost, and that its time is counted all the same."""
+"""Sessions of a run: where one begins, what a crash cost, and what ends one."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+import signal
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from omegaconf import OmegaConf
 
+from flashdex.algorithms import find_algorithm
 from flashdex.errors import RunError
 from flashdex.recipe import RunRecipe
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.training.logging import METRICS
 
+_LOG = logging.getLogger(__name__)
 SESSIONS = "sessions.jsonl"
+LABELS = ("name", "ablation", "seed", "run_dir")  # of the records so far
 SIGNAL = "signal"  # why a session ended, when a person or a scheduler ended it
 
 
 @dataclass(frozen=True)
-class Start:
+class SessionStart:
     """Where a session begins.
 
     Attributes:
@@ -37,18 +43,12 @@ class Start:
 
 def begin_session(
     run_dir: Path, *, env_steps: int, wall_s: float, overrides: list[str]
-) -> Start:
+) -> SessionStart:
     """Work out where a session begins and write its ``start`` line.
 
     The counters go back to the checkpoint. The clock does not: it goes on from the
     latest moment that any file of the run knows of. Env steps beyond the checkpoint
     were simulated for nothing and are added up.
-
-    Args:
-        run_dir: run directory.
-        env_steps: counter of the checkpoint.
-        wall_s: clock of the checkpoint, s.
-        overrides: changes that the session was started with.
     """
     drop_cut_line(run_dir / SESSIONS)
     before = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "start"]
@@ -57,7 +57,7 @@ def begin_session(
     # What an earlier resume has counted already was written before that resume.
     reached = [steps for steps, wall in seen if wall > since]
     lost = max(0, max(reached, default=0) - env_steps)
-    start = Start(
+    start = SessionStart(
         env_steps=env_steps,
         wall_s=max([wall_s, since, *(wall for _, wall in seen)]),
         lost=lost + (before[-1]["env_steps_lost"] if before else 0),
@@ -75,21 +75,9 @@ def begin_session(
 
 
 def end_session(run_dir: Path, why: str, *, env_steps: int, wall_s: float) -> None:
-    """Write the ``end`` line; a session without one crashed, or is running.
-
-    Args:
-        run_dir: run directory.
-        why: what ended it.
-        env_steps: counter at the end.
-        wall_s: clock at the end, s.
-    """
-    line = {
-        "event": "end",
-        "date": _now(),
-        "env_steps": env_steps,
-        "wall_s": wall_s,
-        "why": why,
-    }
+    """Write the ``end`` line; a session without one crashed, or is running."""
+    counters = {"env_steps": env_steps, "wall_s": wall_s}
+    line = {"event": "end", "date": _now(), **counters, "why": why}
     append_line(run_dir / SESSIONS, line)
 
 
@@ -113,25 +101,8 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-# What the records so far were made with, and what the networks and reward statistics
-# of either algorithm mean.
-LABELS = ("name", "ablation", "seed", "run_dir")
-FIXED = (*LABELS, "algo.kind", "algo.groups", "algo.v_max")
-FIXED_FLASHSAC = (
-    *FIXED,
-    "algo.head",
-    "algo.critic_action",
-    "algo.num_atoms",
-    "algo.noise_clock",
-)
-
-
 def stored_value(text: str, key: str) -> Any:
-    """Value of a recipe as it was composed, None where it has no such key.
-
-    Args:
-        text: recipe of a checkpoint, YAML.
-        key: dotted path.
+    """Value of a recipe, YAML, None where it has no such key.
 
     Example:
         >>> stored_value("algo: {v_max: 5.0}", "algo.v_max")
@@ -143,19 +114,14 @@ def stored_value(text: str, key: str) -> Any:
 def refuse_changes(text: str, recipe: RunRecipe) -> None:
     """Refuse a recipe under which the run would be another algorithm.
 
-    Args:
-        text: recipe of the checkpoint, YAML.
-        recipe: what the run is to go on with.
-
     Raises:
         RunError: one message with every value that differs.
     """
-    stored = OmegaConf.create(text)
-    present = OmegaConf.create(dataclasses.asdict(recipe))
-    flashsac = OmegaConf.select(stored, "algo.kind") == "flashsac"
+    present = OmegaConf.to_yaml(dataclasses.asdict(recipe))
+    algorithm = find_algorithm(stored_value(text, "algo.kind"))
     changed = []
-    for key in FIXED_FLASHSAC if flashsac else FIXED:
-        was, now = OmegaConf.select(stored, key), OmegaConf.select(present, key)
+    for key in (*LABELS, *algorithm.immutable_keys):
+        was, now = stored_value(text, key), stored_value(present, key)
         if was != now:
             changed.append(f"{key} from {was} to {now}")
     if changed:
@@ -163,3 +129,43 @@ def refuse_changes(text: str, recipe: RunRecipe) -> None:
             f"these cannot change in a running run: {', '.join(changed)}; start a new "
             "run"
         )
+
+
+class StopSignals:
+    """Notes Ctrl-C, SIGTERM and a closed terminal, for the loop to act on.
+
+    A second Ctrl-C raises KeyboardInterrupt where it falls. A second SIGTERM does
+    nothing: schedulers repeat it, and it must not cost the checkpoint being written.
+
+    Attributes:
+        requested: whether to stop.
+
+    Example:
+        >>> with StopSignals() as stop:
+        ...     stop.requested
+        False
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        names = [signal.SIGINT, signal.SIGTERM]
+        hangup = getattr(signal, "SIGHUP", None)
+        # nohup ignores it, and is taken at its word
+        if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
+            names.append(hangup)
+        self._before = {n: signal.signal(n, self._note) for n in names}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for name, handler in self._before.items():
+            signal.signal(name, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if not self.requested:
+            _LOG.info("stopping after this step; Ctrl-C again stops at once")
+        self.requested = True

@@ -49,12 +49,9 @@ class RunningStats:
         self._calls[phase] += 1
 
     def add(self, names: Sequence[str], sums: Tensor, counts: Tensor) -> None:
-        """Take in sums, and over how many values each of them goes.
+        """Take in sums (K,), and over how many values each goes, (K,) or () for all.
 
-        Args:
-            names: what is logged, K of them, the same at every call of their kind.
-            sums: (K,).
-            counts: (K,), or () for all.
+        The K names must be the same at every call of their kind.
         """
         sums, counts = sums.double(), counts.double().expand(len(names))
         known = self._tables.get(tuple(names))
@@ -63,14 +60,7 @@ class RunningStats:
         self._tables[tuple(names)] = sums, counts
 
     def add_step(self, result: StepResult, done: Tensor, terminated: Tensor) -> None:
-        """Take in one judged vector step.
-
-        Args:
-            result: rewards and errors.
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
-        """
-        self._steps += 1
+        """Take in one scored vector step; flags are (N, 1) bool."""
         values = {f"reward/{{side}}/{k}": v for k, v in result.reward_terms.items()}
         values["reward/{side}/total"] = result.reward
         values["error/{side}/object_pos_mm"] = result.object_pos_error * 1e3
@@ -87,13 +77,14 @@ class RunningStats:
     def add_ends(
         self, done: Tensor, terminated: Tensor, causes: dict[str, Tensor] | None = None
     ) -> None:
-        """Count the episodes that ended.
+        """Count one vector step and the episodes that ended in it, (N, 1) bool.
 
         Args:
-            done: (N, 1) bool.
-            terminated: (N, 1) bool.
+            done: ended.
+            terminated: failed.
             causes: for what; (N, 2) bool each, by hand.
         """
+        self._steps += 1
         causes = causes or {}
         ends = [done.sum(), terminated.sum()]
         ends += [cause.any(-1).sum() for cause in causes.values()]
@@ -111,12 +102,7 @@ class RunningStats:
         self.add(names, found, torch.ones_like(found))
 
     def pop(self, seconds: float, num_envs: int) -> dict[str, float]:
-        """Means since the last call, and forget them; waits for the device.
-
-        Args:
-            seconds: time since the last call.
-            num_envs: worlds of a vector step.
-        """
+        """Means since the last call, ``seconds`` ago; waits for the device."""
         out = {"episode/ends": 0.0, "episode/completed": 0.0}
         for names, (sums, counts) in self._tables.items():
             means = (sums / counts.clamp_min(1e-9)).tolist()
@@ -132,36 +118,3 @@ class RunningStats:
             out[f"perf/ms_{phase}"] = 1e3 * spent / max(self._calls[phase], 1)
         self._clear()
         return out
-
-
-class GymStats(RunningStats):
-    """Adds returns and lengths of finished training episodes.
-
-    Args:
-        num_envs: worlds N.
-    """
-
-    def __init__(self, num_envs: int) -> None:
-        super().__init__()
-        self._returns = torch.zeros(num_envs, 1, dtype=torch.float64)
-        self._lengths = torch.zeros(num_envs, 1, dtype=torch.int64)
-
-    def add_rewards(self, reward: Tensor, terminated: Tensor, done: Tensor) -> None:
-        """Take in one vector step.
-
-        Args:
-            reward: raw, (N, 1); those not finite count as 0.
-            terminated: (N, 1) bool.
-            done: terminated or truncated, (N, 1) bool.
-        """
-        self._steps += 1
-        self._returns += torch.where(reward.isfinite(), reward, 0.0)
-        self._lengths += 1
-        self.add_ends(done, terminated)
-        if not done.any():
-            return
-        finished = {"episode/return": self._returns, "episode/length": self._lengths}
-        sums = [value[done].double().sum() for value in finished.values()]
-        self.add(list(finished), torch.stack(sums), done.sum())
-        for value in finished.values():
-            value[done] = 0

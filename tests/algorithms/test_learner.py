@@ -51,7 +51,7 @@ def test_sample_is_what_the_policy_saw(make_bench, collect, bank):
     collect(env, learner, 15)
     batch = learner.sample()[0]
     assert batch.batch_size == (32,)
-    shown = [assemble(learner.transforms, s) for s in seen]
+    shown = [assemble(learner.rows.transforms, s) for s in seen]
     known = torch.cat([s[keys.OBSERVATION] for s in shown])
     gap = torch.cdist(batch[keys.OBSERVATION], known).min(-1).values
     # half precision of the rows is all that lies between

@@ -20,7 +20,7 @@ GROUPS = ("per_hand", "unified")
 
 @pytest.fixture
 def make_ppo(make_bench):
-    """Build workbench, environment and PPO learner; two of six worlds attempt."""
+    """Make builder, environment and PPO learner; two of six worlds attempt."""
 
     def make(groups="per_hand", *, ppo=None, **env):
         sizes = {"horizon": HORIZON, "epochs": 2, "minibatches": 2, "hidden": [16]}
@@ -46,7 +46,7 @@ def all_equal(one, two):
 def begin(env, learner, collect):
     """Collect the first rollout, which sets the input statistics."""
     td = collect(env, learner, HORIZON)
-    assert learner.due() == 0
+    assert learner.num_updates() == 0
     return td
 
 
@@ -55,13 +55,13 @@ def watch():
     """Have a learner keep what it is told to remember, attempt worlds included."""
 
     def start(learner):
-        told, remember = [], learner.remember
+        told, remember = [], learner.process_step
 
         def keep(*args):
             told.append([a.clone() for a in args])
             remember(*args)
 
-        learner.remember = keep
+        learner.process_step = keep
         return told
 
     return start
@@ -78,9 +78,9 @@ def test_act_remember_update(make_ppo, collect, groups, future):
     for done in range(2):
         before = parameters(learner)
         td = collect(env, learner, HORIZON - 1, td)
-        assert learner.due() == 0
+        assert learner.num_updates() == 0
         td = collect(env, learner, 1, td)
-        assert learner.due() == 1
+        assert learner.num_updates() == 1
         assert learner.num_rows == HORIZON * (WORLDS - ATTEMPTS)
         reports.append(learner.update())
         assert learner.num_rows == 0
@@ -158,16 +158,16 @@ def test_attempts_and_idle_hands_are_not_learnt_from(make_ppo, collect, bank):
     two = make_ppo()[2]
     begin(env, one, collect)
     two.load_state_dict(one.state_dict())
-    remember = one.remember
+    remember = one.process_step
 
     def spoil(state, action, reward, *rest):
         remember(state, action, reward, *rest)
         idle = ~bank.hand_active[state[keys.MOTION].squeeze(-1)] | state[keys.ATTEMPT]
         assert idle[ATTEMPTS:].any()
         action = action.masked_fill(idle.unsqueeze(-1), 7.0)
-        two.remember(state, action, reward.masked_fill(idle, 1e6), *rest)
+        two.process_step(state, action, reward.masked_fill(idle, 1e6), *rest)
 
-    one.remember = spoil
+    one.process_step = spoil
     collect(env, one, HORIZON)
     two.generator.set_state(one.generator.get_state())
     one.update()
@@ -179,7 +179,7 @@ def test_a_blown_up_world_costs_its_last_step_only(make_ppo, collect):
     """Its state is NaN and the episode has ended; the steps before it still count."""
     _, env, learner = make_ppo()
     begin(env, learner, collect)
-    remember, world = learner.remember, WORLDS - 1
+    remember, world = learner.process_step, WORLDS - 1
 
     def blow_up(state, action, reward, after, terminated, done):
         if len(learner._rollout) == 4:
@@ -190,7 +190,7 @@ def test_a_blown_up_world_costs_its_last_step_only(make_ppo, collect):
             terminated[world] = done[world] = True
         remember(state, action, reward, after, terminated, done)
 
-    learner.remember = blow_up
+    learner.process_step = blow_up
     collect(env, learner, HORIZON)
     batches, _, shown = learner.batches()
     motion = shown[keys.GROUP_MASK].unflatten(0, (WORLDS - ATTEMPTS, HORIZON))
@@ -215,8 +215,8 @@ def test_state_dict_continues_bit_for_bit(make_ppo, collect, tmp_path, groups):
     assert not all_equal(one, two)
     two.load_state_dict(load_checkpoint(tmp_path)["learner"])
     assert torch.equal(one.act(td), two.act(td))
-    remember = one.remember
-    one.remember = lambda *args: (remember(*args), two.remember(*args))
+    remember = one.process_step
+    one.process_step = lambda *args: (remember(*args), two.process_step(*args))
     collect(env, one, 3, td)
     assert one.num_rows == 3 * (WORLDS - ATTEMPTS)
     one.forget_episodes()
@@ -255,12 +255,12 @@ def ppo_run(make_ppo, library, tmp_path):
 
 
 def test_a_run_trains_and_is_evaluated(ppo_run, library):
-    from flashdex.training.evaluate import evaluate
+    from flashdex.training.run_dir import evaluate
 
     assert load_checkpoint(ppo_run)["learner"]["updates"] == 2
     result = evaluate(ppo_run)
-    assert [row["motion"] for row in result.rows] == library.names
-    assert result.totals["env_steps"] == WORLDS * HORIZON * 3
+    assert [row["motion"] for row in result["motions"]] == library.names
+    assert result["totals"]["env_steps"] == WORLDS * HORIZON * 3
     assert evaluate(ppo_run, ["env.num_envs=4"]) == result
     with pytest.raises(RunError, match="does not fit the recipe"):
         evaluate(ppo_run, ["algo.ppo.hidden=[32]"])

@@ -7,11 +7,8 @@ import json
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.recipe import GymRecipe, LoopConfig
-from flashdex.replay.disk import ReplayLog
-from flashdex.training.gym_run import make_gym_learner
-from flashdex.training.gym_trainer import GymTrainer
-from flashdex.training.logging import MetricLog
-from flashdex.training.session import Start
+from flashdex.training.gym import GymTask
+from flashdex.training.run_dir import make_trainer
 
 TINY = {
     "batch_size": 16,
@@ -40,22 +37,20 @@ def tiny_recipe(folder, env_id="Pendulum-v1", *, algo=None, train=None, **gym):
         run_dir=str(folder),
         gym=GymConfig(env_id=env_id, **config),
         algo=AlgoConfig(**{**TINY, **(algo or {})}),
-        train=LoopConfig(**(train or {})),
+        # no record by time: on a slow machine it would be one more
+        train=LoopConfig(**{"log_every_s": 1e6, **(train or {})}),
     )
 
 
 def trainer_of(recipe, tmp_path):
     folder = tmp_path / "loose"
     folder.mkdir(parents=True)
-    learner = make_gym_learner(recipe)
-    return GymTrainer(
-        recipe,
-        folder,
-        learner,
-        MetricLog(folder, recipe),
-        start=Start(env_steps=0, wall_s=0.0, lost=0),
-        replay=ReplayLog(folder, learner.buffer, meaning=""),
-    )
+    return make_trainer(GymTask(recipe), folder)
+
+
+def learner_of(recipe):
+    task = GymTask(recipe)
+    return task.make_learner(task.make_env())
 
 
 def read_metrics(folder):

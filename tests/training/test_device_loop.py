@@ -18,7 +18,8 @@ from flashdex.rollouts.recorder import LOOK_EVERY, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer
 from flashdex.training.guard import GradientGuard
 from flashdex.training.logging import MetricLog
-from flashdex.training.session import Start
+from flashdex.training.session import SessionStart
+from flashdex.training.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 
@@ -36,18 +37,19 @@ def make_trainer(make_bench, tmp_path):
         recipe = dataclasses.replace(bench.recipe, physics=physics)
         bench = dataclasses.replace(bench, recipe=recipe)
         env = unseen(bench.make_env())
-        ledger = Ledger(
+        task = TrackingTask(bench)
+        task.env, task.recorder = env, EpisodeRecorder(env)
+        task.ledger = Ledger(
             tmp_path, bench.bank.names, criterion="sr_mt_obj", seed=0, engine=engine
         )
+        maker = bench.rollout_builder(env.physics.scenes)
+        task.scorer = InlineScorer(task.ledger, maker)
         trainer = Trainer(
-            recipe,
+            task,
             tmp_path,
-            env,
             bench.make_learner(env),
-            ledger,
-            InlineScorer(ledger, bench.rollout_builder(env.physics.scenes)),
             MetricLog(tmp_path, recipe),
-            start=Start(env_steps=0, wall_s=0.0, lost=0),
+            start=SessionStart(env_steps=0, wall_s=0.0, lost=0),
         )
         trainer.guard = GradientGuard(waits=False)
         return trainer
@@ -58,8 +60,7 @@ def make_trainer(make_bench, tmp_path):
 def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer):
     algo = {"min_buffer": 20, "updates_per_step": 2.0}
     trainer = make_trainer("warp", algo=algo, assist=AssistConfig(enabled=True))
-    td = trainer.env.reset()
-    trainer.recorder.record_start()
+    td = trainer.reset()
     with trainer.guard:
         for _ in range(LOOK_EVERY):
             td = trainer.vector_step(td)
@@ -68,7 +69,7 @@ def test_a_vector_step_with_its_updates_waits_for_nothing(make_trainer):
             for _ in range(LOOK_EVERY - 1):
                 td = trainer.vector_step(td)
     assert trainer.learner.updates == before + 2 * (LOOK_EVERY - 1)
-    trainer.alongside.close()
+    trainer.worker.close()
     assert trainer.stats.pop(1.0, 4)["episode/ends"] > 0
 
 

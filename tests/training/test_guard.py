@@ -12,9 +12,13 @@ from flashdex import keys
 from flashdex.errors import RunError
 from flashdex.replay.codec import finite_rows
 from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.guard import GradientGuard, NonFiniteError, first_non_finite
-from flashdex.training.nan_dump import DUMP, reopen
-from flashdex.training.run_dir import resume
+from flashdex.training.guard import (
+    DUMP,
+    GradientGuard,
+    NonFiniteError,
+    first_non_finite,
+)
+from flashdex.training.run_dir import reopen, resume
 
 BAD = (float("nan"), float("inf"), -float("inf"))
 
@@ -124,7 +128,7 @@ def test_bad_steps_never_enter_the_buffer(make_bench, where, bad):
     else:
         after[keys.OBJECT_POSE][2, 0, 0] = bad
         ended[2] = where == "terminal"
-    learner.remember(state, action, reward, after, ended, ended)
+    learner.process_step(state, action, reward, after, ended, ended)
     # Packing makes NaN zero; it cuts infinity to the largest float32, and half
     # precision does not reach that far.
     kept = 4 if where == "terminal" and bad != bad else 3

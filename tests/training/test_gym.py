@@ -11,17 +11,23 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gym_runs import STEPS, TINY, read_metrics, tiny_recipe, trainer_of
+from gym_runs import STEPS, TINY, learner_of, read_metrics, tiny_recipe, trainer_of
+from tensordict import TensorDict
 
 from flashdex.cli.main import main
 from flashdex.envs.config import GymConfig
-from flashdex.envs.gym import GymWorlds
+from flashdex.envs.gym import GymEnv
 from flashdex.recipe import GymRecipe, compose
-from flashdex.training.evaluator import evaluate_policy, observed
-from flashdex.training.gym_run import make_gym_learner, train_gym
+from flashdex.training.gym import evaluate_policy
+from flashdex.training.run_dir import train
 
 # The published curves are those of the -v4 environments.
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
+
+
+def observed(observation):
+    """The state that a learner reads of observations, (N, D)."""
+    return TensorDict({"observation": observation}, [len(observation)])
 
 
 @pytest.fixture
@@ -35,35 +41,41 @@ def make_recipe(tmp_path):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """Folder of a run that has reached its budget; not to be changed."""
-    return train_gym(tiny_recipe(tmp_path_factory.mktemp("gym") / "run"))
+    return train(tiny_recipe(tmp_path_factory.mktemp("gym") / "run"))
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "InvertedPendulum-v4"])
 def test_worlds_agree_with_environments_stepped_by_hand(env_id):
     limit, seed = 9, 3
     config = GymConfig(env_id=env_id, max_episode_steps=limit)
-    worlds = GymWorlds(config, num_envs=2, seed=seed)
+    worlds = GymEnv(config, num_envs=2, seed=seed)
     hand = [gymnasium.make(env_id, max_episode_steps=limit) for _ in range(2)]
     space = hand[0].action_space
     starts = [e.reset(seed=seed + i)[0] for i, e in enumerate(hand)]
-    np.testing.assert_allclose(worlds.reset(), starts, rtol=1e-6, atol=1e-7)
+    td = worlds.reset()
+    np.testing.assert_allclose(td["observation"], starts, rtol=1e-6, atol=1e-7)
     generator = torch.Generator().manual_seed(0)
     ends = {"terminated": 0, "truncated": 0}
     for _ in range(25):
         action = 2 * torch.rand(2, worlds.action_dim, generator=generator) - 1
-        step = worlds.step(action)
+        worlds.put_action(td, action)
+        step = worlds.step(td)["next"]
         scaled = space.low + (action.numpy() + 1) / 2 * (space.high - space.low)
         found = [e.step(a) for e, a in zip(hand, scaled, strict=True)]
         observation, reward, terminated, truncated, _ = zip(*found, strict=True)
-        np.testing.assert_allclose(step.observation, observation, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(step.reward[:, 0], reward, rtol=1e-4, atol=1e-4)
-        assert step.terminated[:, 0].tolist() == list(terminated)
+        np.testing.assert_allclose(
+            step["observation"], observation, rtol=1e-4, atol=1e-4
+        )
+        np.testing.assert_allclose(step["reward"][:, 0], reward, rtol=1e-4, atol=1e-4)
+        assert step["terminated"][:, 0].tolist() == list(terminated)
         only = [c and not t for c, t in zip(truncated, terminated, strict=True)]
-        assert step.truncated[:, 0].tolist() == only
+        assert step["truncated"][:, 0].tolist() == only
         ends["terminated"] += sum(terminated)
         ends["truncated"] += sum(only)
-        if step.done.any():
-            after = worlds.reset_done(step.done)
+        td = step
+        if step["done"].any():
+            td = worlds.restart(step["done"].squeeze(-1))
+            after = td["observation"]
             for i, env in enumerate(hand):
                 is_new = terminated[i] or truncated[i]
                 wanted = env.reset()[0] if is_new else observation[i]
@@ -83,10 +95,9 @@ def swing(observation, action):
 
 def test_replay_holds_true_observations_where_an_episode_is_cut(make_recipe, tmp_path):
     trainer = trainer_of(make_recipe(algo={"min_buffer": 90}), tmp_path)
-    worlds = GymWorlds(trainer.recipe.gym, num_envs=1, seed=0)
-    observation = worlds.reset()
+    td = trainer.reset()
     for _ in range(3 * STEPS):
-        observation = trainer.vector_step(worlds, observation)
+        td = trainer.vector_step(td)
     rows = trainer.learner.buffer[:]
     following, reward = swing(rows["observation"], 2 * rows["action"])
     torch.testing.assert_close(
@@ -102,7 +113,7 @@ def test_replay_holds_true_observations_where_an_episode_is_cut(make_recipe, tmp
 
 def test_warmup_is_uniform(make_recipe):
     recipe = make_recipe(num_envs=1)
-    learner = make_gym_learner(recipe)
+    learner = learner_of(recipe)
     state = observed(torch.zeros(4000, 3))
     drawn = learner.act(state).squeeze(-1).sort().values
     expected = torch.linspace(-1, 1, 4000)
@@ -115,9 +126,9 @@ def test_warmup_is_uniform(make_recipe):
 
 def test_evaluation_agrees_with_episodes_played_by_hand(make_recipe):
     recipe = make_recipe("InvertedPendulum-v4", max_episode_steps=None)
-    learner = make_gym_learner(recipe)
+    learner = learner_of(recipe)
     before = learner.generator.get_state()
-    found = evaluate_policy(learner, GymWorlds(recipe.gym, num_envs=3, seed=5))
+    found = evaluate_policy(learner, GymEnv(recipe.gym, num_envs=3, seed=5))
     assert torch.equal(before, learner.generator.get_state())
     env = gymnasium.make("InvertedPendulum-v4")
     for i in range(3):
@@ -161,7 +172,7 @@ def test_a_run_trains_logs_and_resumes(tmp_path, capsys):
 
 
 def test_two_runs_of_one_seed_are_equal(finished, make_recipe):
-    again = train_gym(make_recipe())
+    again = train(make_recipe())
     first, second = (read_metrics(folder)[-1] for folder in (finished, again))
     same = [key for key in first if not key.startswith(("perf/", "hours"))]
     assert {k: first[k] for k in same} == {k: second[k] for k in same}
@@ -191,6 +202,6 @@ def test_pendulum_is_learnt(tmp_path):
     words += ["algo.init_std=0.5", "algo.lr=1e-3", "algo.lr_final=9e-4"]
     recipe = compose("gym_halfcheetah_small", words)
     assert isinstance(recipe, GymRecipe)
-    records = read_metrics(train_gym(recipe))
+    records = read_metrics(train(recipe))
     returns = [r["eval/return"] for r in records if "eval/return" in r]
     assert returns[-1] > 0.4 * returns[0], returns

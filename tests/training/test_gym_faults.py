@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import os
+import shutil
 import signal
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gym_runs import read_metrics, tiny_recipe, trainer_of
 
 from flashdex.cli.main import main
 from flashdex.errors import FlashdexError, RunError
+from flashdex.system.files import LOCK, run_lock
 from flashdex.training.checkpoint import newest_checkpoint
-from flashdex.training.evaluator import SEED_OFFSET
-from flashdex.training.gym_run import resume_gym, train_gym
+from flashdex.training.guard import DUMP, GradientGuard, NonFiniteError
+from flashdex.training.gym import SEED_OFFSET
+from flashdex.training.run_dir import evaluate, reopen, resume, train
+from flashdex.training.session import ended_by
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 
@@ -170,10 +178,10 @@ def test_a_checkpoint_that_cannot_be_written_does_not_end_the_run(
 
 
 def test_a_finished_run_does_nothing_when_resumed(make_recipe):
-    folder = train_gym(make_recipe())
+    folder = train(make_recipe())
     wanted = ["metrics.jsonl", f"checkpoints/{120:012d}.pt"]
     before = [(folder / name).read_bytes() for name in wanted]
-    resume_gym(folder)
+    resume(folder)
     assert [(folder / name).read_bytes() for name in wanted] == before
     assert newest_checkpoint(folder) == f"checkpoints/{120:012d}.pt"
 
@@ -210,11 +218,11 @@ def test_environments_that_cannot_be_used_exit_two(env_id, expected, tmp_path, c
 def test_the_missing_package_is_named_with_its_extra(monkeypatch, make_recipe):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(FlashdexError, match=r"pip install '\.\[gym\]'"):
-        train_gym(make_recipe())
+        train(make_recipe())
 
 
 def test_changed_networks_do_not_resume(make_recipe, capsys):
-    folder = train_gym(make_recipe())
+    folder = train(make_recipe())
     before = (folder / "recipe.yaml").read_text()
     words = [str(folder), "algo.critic_width=24"]
     for verb in (["train", "total_env_steps=200", "--resume"], ["evaluate"]):
@@ -223,3 +231,143 @@ def test_changed_networks_do_not_resume(make_recipe, capsys):
         assert "does not fit the recipe" in err
         assert err.count("size mismatch") == 1  # of dozens
     assert (folder / "recipe.yaml").read_text() == before
+
+
+# what a run on a stock environment shares with every other
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder of a finished run with two checkpoints and its rows; to be copied."""
+    train_settings = {"checkpoint_replay": True}
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    train(tiny_recipe(folder, train=train_settings))
+    resume(folder, ["total_env_steps=160"])
+    return folder
+
+
+@pytest.fixture
+def ended(whole, tmp_path):
+    return Path(shutil.copytree(whole, tmp_path / "ended"))
+
+
+def change_newest(run_dir, change):
+    path = max((run_dir / "checkpoints").glob("*.pt"))
+    state = torch.load(path, weights_only=True)
+    change(state)
+    torch.save(state, path)
+
+
+def content(run_dir):
+    return {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    "change", ["algo.head=centred", "algo.num_atoms=21", "algo.v_max=3.0", "seed=4"]
+)
+def test_a_resume_refuses_what_would_be_another_algorithm(ended, change):
+    kept = content(ended)
+    key = change.split("=")[0]
+    with pytest.raises(RunError, match=f"cannot change in a running run: {key} from"):
+        resume(ended, [change, "total_env_steps=200"])
+    assert content(ended) == kept
+
+
+def test_a_run_is_not_begun_in_a_folder_that_somebody_holds(make_recipe):
+    recipe = make_recipe()
+    folder = Path(recipe.run_dir)
+    folder.mkdir()
+    with run_lock(folder), pytest.raises(RunError, match="another process"):
+        train(recipe)
+    assert [p.name for p in folder.iterdir()] == [LOCK]
+
+
+def test_a_step_that_the_device_skipped_ends_the_run(make_recipe, tmp_path):
+    trainer = trainer_of(make_recipe(), tmp_path)
+    trainer.guard = GradientGuard(waits=False)
+
+    def poison():
+        trainer.guard._flag = torch.ones(())
+
+    trainer.log.writers.append(Writer(poison))
+    with pytest.raises(RunError, match="skipped on the device"):
+        trainer.run()
+    assert trainer.env_steps == 100  # the record after that of step 50
+    assert newest_checkpoint(trainer.run_dir) == "none"
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(ended, caplog):
+    newest = max((ended / "checkpoints").glob("*.pt"))
+    os.truncate(newest, newest.stat().st_size // 2)
+    resume(ended, ["total_env_steps=200"])
+    assert f"{newest.name} cannot be read" in caplog.text
+    assert newest.with_suffix(".unreadable").is_file()
+    assert read_metrics(ended)[-1]["env_steps"] == 200
+    assert read_metrics(ended)[-1]["env_steps_lost"] == 40
+
+
+@pytest.mark.parametrize("fault", ["groups", "number", "absent"])
+def test_a_checkpoint_with_another_inside_is_refused(ended, fault):
+    def change(state):
+        stepper = state["learner"]["agent"]["stepper"]
+        if fault == "groups":  # a ValueError of torch
+            groups = stepper["critic_optimizer"]["adam"]["param_groups"]
+            groups.append(groups[0])
+        elif fault == "number":
+            stepper["critic_optimizer"] = 3
+        else:
+            del state["learner"]["agent"]
+
+    change_newest(ended, change)
+    for verb in (resume, evaluate):
+        with pytest.raises(RunError, match="does not fit the recipe"):
+            verb(ended, ["gym.eval_episodes=1"])
+
+
+def test_a_resume_asks_for_what_it_needs(ended):
+    def change(state):
+        del state["wall_s"], state["wandb_id"]
+
+    change_newest(ended, change)
+    assert evaluate(ended, ["gym.eval_episodes=1"])["env_steps"] == 160
+    with pytest.raises(RunError, match=r"lacks wall_s, wandb_id\."):
+        resume(ended)
+
+
+def test_a_checkpoint_of_an_earlier_version_goes_on(ended):
+    def change(state):
+        for key in ("recipe", "vector_steps", "torch_rng", "env_steps_lost"):
+            del state[key]
+
+    change_newest(ended, change)
+    before = read_metrics(ended)[-1]
+    with pytest.raises(RunError, match=r"algo\.head from"):
+        resume(ended, ["algo.head=centred"])
+    resume(ended, ["total_env_steps=200"])
+    last = read_metrics(ended)[-1]
+    assert (last["env_steps"], last["buffer/rows"]) == (200, before["buffer/rows"] + 40)
+
+
+def test_what_is_not_finite_is_dumped_to_be_repeated(ended):
+    for path in (ended / "checkpoints/replay").glob("*.pt"):
+        rows = torch.load(path, weights_only=True)
+        rows["reward"][:] = math.nan
+        torch.save(rows, path)
+    with pytest.raises(RunError, match=r"batch entry 'next\.reward'") as caught:
+        resume(ended, ["total_env_steps=400"])
+    assert DUMP in str(caught.value)
+    learner, repeat = reopen(ended / DUMP)
+    assert learner.updates >= 25
+    with pytest.raises(NonFiniteError):
+        repeat()
+
+
+def test_a_wall_limit_ends_with_an_evaluation(make_recipe):
+    rare = {"eval_every_env_steps": 10**9, "train": {"wall_limit_s": 1.0}}
+    recipe = dataclasses.replace(make_recipe(**rare), total_env_steps=10**9)
+    run_dir = train(recipe)
+    records = read_metrics(run_dir)
+    assert ended_by(run_dir) == "wall_limit_s"
+    assert [r for r in records if "eval/return" in r] == records[-1:]
+    newest = newest_checkpoint(run_dir)
+    assert f"{records[-1]['env_steps']:012.0f}.pt" in newest

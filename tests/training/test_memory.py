@@ -35,7 +35,7 @@ ROOMY = Machine(gpu=None, host=100 * GB, disk=100 * GB)
 
 @pytest.fixture
 def trained(make_bench, collect):
-    """A tiny workbench, its learner after updates, and their plan."""
+    """A tiny builder, its learner after updates, and their plan."""
 
     def make(**options):
         bench = make_bench(6, **options)
@@ -154,7 +154,7 @@ def test_the_learner_takes_no_more_than_planned(make_bench, collect, kind):
         learner = bench.make_learner(env)
         for _ in range(2):  # Adam's moments are there in the second round
             collect(env, learner, 24)
-            learner.due()
+            learner.num_updates()
             learner.update()
     planned = sum(p.size for p in plan.parts if p.name in LEARNER)
     # samples are assembled before the update, so that both peaks are not there at once

@@ -98,7 +98,7 @@ def test_flashsac_acts_remembers_and_learns(make_bench, collect, groups, replay)
     step = one_step(env, learner)
     with device_alone():
         learner.act(step[0])  # before there are rows
-        learner.remember(*step)
+        learner.process_step(*step)
     collect(env, learner, 12)
     assert learner.ready
     guard, stats = GradientGuard(waits=False), RunningStats()
@@ -111,15 +111,15 @@ def test_flashsac_acts_remembers_and_learns(make_bench, collect, groups, replay)
             for reward in (step[2], bad):
                 learner.act(step[0])
                 learner.act(step[0], explore=False)
-                learner.remember(step[0], step[1], reward, *step[3:])
+                learner.process_step(step[0], step[1], reward, *step[3:])
                 # one of two updates has an actor step
-                for _ in range(learner.due()):
+                for _ in range(learner.num_updates()):
                     with numeric_errors(learner):
                         stats.add_update(learner.update())
         guard.check()
     assert learner.updates == before + 1 + 4
     for _ in range(2):
-        learner.remember(*step)  # the window passes the bad reward
+        learner.process_step(*step)  # the window passes the bad reward
     assert learner.num_dropped == dropped + 3  # one in each window it is part of
     found = stats.pop(1.0, WORLDS)
     side = "left" if groups == "per_hand" else "both"
@@ -134,11 +134,11 @@ def test_ppo_acts_and_remembers(make_bench, collect):
     env = bench.make_env()
     learner = bench.make_learner(env)
     step = one_step(env, learner)
-    learner.remember(*step)
+    learner.process_step(*step)
     with device_alone():
         learner.act(step[0])
-        learner.remember(*step)
-        assert learner.due() == 0
+        learner.process_step(*step)
+        assert learner.num_updates() == 0
     assert learner.num_rows == 2 * (WORLDS // 2)
 
 
@@ -155,7 +155,7 @@ def test_a_gradient_step_of_ppo_does_not_wait(make_bench, collect):
     learner = bench.make_learner(env)
     for _ in range(2):  # the first rollout sets the input statistics
         collect(env, learner, 4)
-        learner.due()
+        learner.num_updates()
     batches, tail, _ = learner.batches()
     for name, agent in learner.agents.items():
         rows = agent.estimate(batches[name], tail).reshape(-1)

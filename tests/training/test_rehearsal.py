@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from benchmarks.common.ceilings import count_products, total_flops
-from flashdex.algorithms.agent import make_actor, make_critic
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.flashsac import make_actor, make_critic
 from flashdex.objectives.batch import FlashBatch
 from flashdex.objectives.flashsac import FlashSACLoss
 from flashdex.training.rehearsal import Networks, PeakMeter, flashsac_update

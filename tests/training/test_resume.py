@@ -23,8 +23,13 @@ from flashdex.system.files import run_lock
 from flashdex.system.jsonl import append_line, keep_lines, read_lines
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
 from flashdex.training.run_dir import resume
-from flashdex.training.session import SESSIONS, begin_session, end_session, ended_by
-from flashdex.training.stop_signals import StopSignals
+from flashdex.training.session import (
+    SESSIONS,
+    StopSignals,
+    begin_session,
+    end_session,
+    ended_by,
+)
 
 KEYS = ("env_steps", "hours", "updates")
 
@@ -56,7 +61,7 @@ def test_updates_go_on_bit_equal_through_files(
     ours, theirs = (x.agent.loss.state_dict() for x in (one, two))
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)
     assert torch.equal(one.act(td), two.act(td))
-    assert one.due() == two.due()
+    assert one.num_updates() == two.num_updates()
 
 
 def test_a_resumed_run_has_its_rows_and_learns_on(train_tiny, caplog):

@@ -10,23 +10,23 @@ import torch
 
 from flashdex.envs.tracking import few_threads
 from flashdex.training.checkpoint import load_checkpoint
-from flashdex.training.trainer import Alongside
+from flashdex.training.trainer import BackgroundWorker
 
 
 @pytest.mark.parametrize("threaded", [True, False])
 def test_work_has_ended_when_the_block_is_left(threaded):
     done = []
-    alongside = Alongside(threaded=threaded)
-    with alongside.run(lambda: done.append(threading.current_thread().name)):
+    worker = BackgroundWorker(threaded=threaded)
+    with worker.run(lambda: done.append(threading.current_thread().name)):
         pass
-    alongside.close()
+    worker.close()
     assert len(done) == 1
     assert done[0].startswith("learner") == threaded
 
 
 def test_both_run_at_the_same_time():
     meet = threading.Barrier(2, timeout=20)  # breaks unless both sides come
-    with Alongside(threaded=True).run(meet.wait):
+    with BackgroundWorker(threaded=True).run(meet.wait):
         meet.wait()
     assert not meet.broken
 
@@ -43,8 +43,8 @@ def test_the_work_keeps_its_torch_threads():
 
     lowered = threading.Event()
     try:
-        alongside = Alongside(threaded=True)
-        with alongside.run(work), few_threads(1):
+        worker = BackgroundWorker(threaded=True)
+        with worker.run(work), few_threads(1):
             lowered.set()
             while not found:
                 time.sleep(0.001)
@@ -61,7 +61,7 @@ def test_an_error_of_the_work_comes_out(threaded):
 
     with (
         pytest.raises(ArithmeticError, match="inside"),
-        Alongside(threaded=threaded).run(work),
+        BackgroundWorker(threaded=threaded).run(work),
     ):
         pass
 
@@ -70,7 +70,7 @@ def test_an_error_of_the_block_is_shown_first():
     def work():
         raise ArithmeticError("inside")
 
-    with pytest.raises(KeyError), Alongside(threaded=True).run(work):
+    with pytest.raises(KeyError), BackgroundWorker(threaded=True).run(work):
         raise KeyError
 
 

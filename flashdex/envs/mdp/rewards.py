@@ -5,7 +5,7 @@ Every reward is one number per world and hand, (N, 2), from 0 to 1 unless it pun
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 
 import torch
 from torch import Tensor
@@ -155,12 +155,12 @@ def fingertip_distance_exp(
     return torch.exp(-(dist - ref_dist).clamp_min(0) / sigma).mean(-1)
 
 
-@reward(
-    "wrist_pos",
-    weight=0.15,
-    inputs=lambda step: (step.kin["wrist_pos"], step.ref["wrist_pos"]),
-    gate="imitation",
-)
+def _both(name: str) -> Callable[[Step], tuple[Tensor, Tensor]]:
+    """A quantity of the robot hand and of the human one."""
+    return lambda step: (step.kin[name], step.ref[name])
+
+
+@reward("wrist_pos", weight=0.15, inputs=_both("wrist_pos"), gate="imitation")
 def wrist_pos_error_exp(
     pos: Tensor, ref_pos: Tensor, *, scale: float = number(10.0, above=0)
 ) -> Tensor:
@@ -174,12 +174,7 @@ def wrist_pos_error_exp(
     return torch.exp(-scale * (pos - ref_pos).norm(dim=-1))
 
 
-@reward(
-    "wrist_rot",
-    weight=0.15,
-    inputs=lambda step: (step.kin["wrist_quat"], step.ref["wrist_quat"]),
-    gate="imitation",
-)
+@reward("wrist_rot", weight=0.15, inputs=_both("wrist_quat"), gate="imitation")
 def wrist_rot_error_exp(
     quat: Tensor, ref_quat: Tensor, *, scale: float = number(3.0, above=0)
 ) -> Tensor:
@@ -193,12 +188,7 @@ def wrist_rot_error_exp(
     return torch.exp(-scale * quat_angle(quat, ref_quat))
 
 
-@reward(
-    "fingertip_pos",
-    weight=0.3,
-    inputs=lambda step: (step.kin["tip_pos"], step.ref["tip_pos"]),
-    gate="imitation",
-)
+@reward("fingertip_pos", weight=0.3, inputs=_both("tip_pos"), gate="imitation")
 def fingertip_pos_error_exp(
     pos: Tensor, ref_pos: Tensor, *, scale: float = number(20.0, above=0)
 ) -> Tensor:

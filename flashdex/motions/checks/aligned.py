@@ -17,7 +17,7 @@ from flashdex.motions.contact.activity import has_moved, motion_of
 from flashdex.motions.contact.fingertips import local_tips
 from flashdex.motions.contact.roles import Interaction
 from flashdex.motions.findings import Finding, info, reject, warn
-from flashdex.motions.retarget.starts import Attempt
+from flashdex.motions.retarget.solver import Attempt
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices
 

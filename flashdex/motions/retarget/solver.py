@@ -81,17 +81,13 @@ def _near(angles: np.ndarray, previous: np.ndarray) -> np.ndarray:
 class Start:
     """Where the iterations of an attempt begin.
 
-    Args:
-        back: m that the hand is moved back along its palm normal. Then contact counts
-            from the first iteration, so that fingers come to the object from outside
-            and do not end up on its wrong side.
-        curl: share of the fingers' range, 0 straight; None for a relaxed hand.
-        side: m, a further shift in the world.
+    Of a hand that is moved back, contact counts from the first iteration, so that the
+    fingers come to the object from outside and do not end up on its wrong side.
     """
 
-    back: float = 0.0
-    curl: float | None = None
-    side: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    back: float = 0.0  # m, against the palm normal
+    curl: float | None = None  # share of the fingers' range, 0 straight; None: relaxed
+    side: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, a further shift, world
 
 
 @dataclass

@@ -10,7 +10,7 @@ from flashdex.motions.contact.roles import NO_OBJECT, Interaction
 from flashdex.motions.contact.support import support_disks
 from flashdex.motions.library import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
-from flashdex.motions.retarget.starts import Choice
+from flashdex.motions.retarget.solver import Choice
 from flashdex.motions.retarget.targets import Targets
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices

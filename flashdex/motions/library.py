@@ -110,15 +110,9 @@ class MotionLibrary:
         return self.names.index(name)
 
     def index(self, motion: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
-        """Rows of ``frames``: start + clamp(frame, 0, length - 1).
-
-        Args:
-            motion: rows of ``motions``, int64, (...).
-            frame: frame within the motion, int64, (...); clamped to the motion.
-        """
-        motions = self.motions
-        last = motions["length"][motion] - 1
-        return motions["start"][motion] + torch.minimum(frame.clamp_min(0), last)
+        """Rows of ``frames``, int64, (...): start + clamp(frame, 0, length - 1)."""
+        start, length = self.motions["start"][motion], self.motions["length"][motion]
+        return start + torch.minimum(frame.clamp_min(0), length - 1)
 
     def at(self, motion: torch.Tensor, frame: torch.Tensor) -> TensorDict:
         """Frames of motions, gathered; batch size of the broadcast arguments."""

@@ -100,14 +100,9 @@ def compute_mass_properties(
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Mass, centre of mass and inertia of a homogeneous solid.
 
-    The solid is the mesh where it bounds a volume, else the sum of its convex parts.
+    The solid is the mesh (cleaned, m) where it bounds a volume, else the sum of its
+    convex parts (vertices, m, each (V, 3)). Density is kg/m^3, limits are kg.
     ``inertia = mass / volume * (integral of |r|^2 1 - r r^T over the solid)``.
-
-    Args:
-        mesh: cleaned triangles, m.
-        parts: hull vertices, m, each (V, 3).
-        density: kg/m^3.
-        mass_limits: kg.
 
     Returns:
         Mass, kg; centre of mass in the object frame, m, (3,); inertia about the centre

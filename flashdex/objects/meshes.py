@@ -182,13 +182,8 @@ def sample_surface_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Evenly spread surface points in farthest-point order, with outward normals.
 
-    Args:
-        mesh: triangles in the object frame, m.
-        count: number of points, P.
-        seed: of the dense area-weighted sample.
-
     Returns:
-        Points, m, (P, 3), and unit normals of their triangles, (P, 3).
+        Points, m, object frame, (P, 3), and unit normals of their triangles, (P, 3).
     """
     number = SAMPLES_PER_POINT * count
     dense, face, *_ = trimesh.sample.sample_surface(mesh, number, seed=seed)

@@ -25,12 +25,8 @@ def make_distance_grid(
     Distances are exact point-triangle distances (see :func:`surface_distance`); the
     sign is that of the generalised winding number minus one half.
 
-    Args:
-        mesh: triangles, m; needs no watertightness.
-        resolution: nodes along each axis, R.
-        margin: room between the bounding box and the cube, m.
-        watertight: whether the surface is closed, so that one sign serves each region
-            it bounds; otherwise every node in the bounding box decides alone.
+    Of a watertight mesh one sign serves each region that it bounds; otherwise every
+    node in the bounding box decides alone. There are R = ``resolution`` nodes an axis.
 
     Returns:
         Values at the nodes, m, negative inside, (R, R, R), axes x, y, z; node

@@ -20,9 +20,7 @@ _known: dict[str, np.ndarray] = {}  # by the object's hash: many motions share o
 def make_slot_grid(assets: list[ObjectAsset], *, solid: bool) -> SdfGrid:
     """Distance grids of a motion's objects in float64, row = slot.
 
-    Args:
-        assets: objects by slot.
-        solid: of mesh and convex parts together, instead of the mesh alone.
+    With ``solid`` they are of mesh and convex parts together, else of the mesh alone.
     """
     values = [_solid_values(a) if solid else a.sdf for a in assets]
     return SdfGrid(

@@ -27,7 +27,7 @@ from flashdex.motions.pipeline.motion import MotionSettings, prepare_recording
 from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.motions.repair.jumps import JUMP_SPEED
 from flashdex.motions.retarget.penetration import Penetration
-from flashdex.motions.retarget.starts import Attempt, Choice
+from flashdex.motions.retarget.solver import Attempt, Choice
 from flashdex.motions.retarget.targets import make_targets
 from flashdex.objects.asset import ObjectSettings
 

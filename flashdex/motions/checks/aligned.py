@@ -17,7 +17,7 @@ from flashdex.motions.contact.activity import has_moved, motion_of
 from flashdex.motions.contact.fingertips import local_tips
 from flashdex.motions.contact.roles import Interaction
 from flashdex.motions.findings import Finding, info, reject, warn
-from flashdex.motions.retarget.starts import Attempt
+from flashdex.motions.retarget.solver import Attempt
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices
 
@@ -228,13 +228,13 @@ def check_up(
     objects at rest at the start and at the end. Another axis is suggested only if its
     table holds, and something rises from it: a track in one plane proves nothing.
 
-    Args:
-        poses: of each object in a world that is taken to be z up, (T, 7).
-        vertices: of each mesh (those of its hull do), m, (V, 3).
-        fps: frames a second.
-        up: what the recording says is up; only to name axes in its own world.
+    Poses (T, 7) are of a world that is taken to be z up; vertices (m, (V, 3)) may be
+    those of the hull; ``up`` is what the recording says, only to name its own axes.
     """
-    rest = [_ends_at_rest(pose, fps) for pose in poses]
+    # one frame of every still run at the start or the end
+    spans = [still_runs(pose, fps) for pose in poses]
+    last = len(poses[0])
+    rest = [[(a + b) // 2 for a, b in s if a == 0 or b == last] for s in spans]
     if not any(rest):
         return []
     fault, _ = _table(poses, vertices, rest, AXES["+z"])
@@ -252,12 +252,6 @@ def check_up(
         f"{100 * better[name]:.1f} cm along {own}: is up {own}?"
     )
     return [warn("W_UP", text)]
-
-
-def _ends_at_rest(pose: np.ndarray, fps: float) -> list[int]:
-    """One frame of every still run at the start or the end."""
-    spans = still_runs(pose, fps)
-    return [(a + b) // 2 for a, b in spans if a == 0 or b == len(pose)]
 
 
 def _table(

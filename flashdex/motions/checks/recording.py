@@ -6,7 +6,6 @@ import numpy as np
 
 from flashdex.datasets.demo import MAX_SECONDS, MIN_SECONDS, HumanDemo
 from flashdex.datasets.tracks import rotation
-from flashdex.keys import Side
 from flashdex.motions.findings import Finding, reject, warn
 from flashdex.motions.repair.jumps import JUMP_EVENTS, jump_steps
 from flashdex.motions.repair.repair import FILLED
@@ -81,16 +80,13 @@ def _check_missing(demo: HumanDemo) -> list[Finding]:
 
 def check_sides(demo: HumanDemo) -> list[Finding]:
     """Fingers that bend out of the back of the hand: it is the other hand."""
-    return [found for side in demo.keypoints for found in _check_side(demo, side)]
-
-
-def _check_side(demo: HumanDemo, side: Side) -> list[Finding]:
-    out_of_palm = rotation(demo.palm[side][:, 3:]).as_matrix()[..., 2]
-    points = demo.keypoints[side]
-    fingers = points[:, TIPS] - points[:, KNUCKLES]
-    bend = float(np.einsum("ti,tfi->tf", out_of_palm, fingers).mean())
-    if bend > BENT_BACK:
-        return []
-    text = f"the {side} hand's fingers bend {-100 * bend:.0f} cm out of its back; "
-    text += "are left and right swapped, or is the world mirrored?"
-    return [reject("E_SIDE", text)]
+    found = []
+    for side, points in demo.keypoints.items():
+        out_of_palm = rotation(demo.palm[side][:, 3:]).as_matrix()[..., 2]
+        fingers = points[:, TIPS] - points[:, KNUCKLES]
+        bend = float(np.einsum("ti,tfi->tf", out_of_palm, fingers).mean())
+        if not bend > BENT_BACK:
+            text = f"the {side} hand's fingers bend {-100 * bend:.0f} cm out of its "
+            text += "back; are left and right swapped, or is the world mirrored?"
+            found.append(reject("E_SIDE", text))
+    return found

@@ -72,10 +72,7 @@ def nearest_tips(
 
     Only tips within 3 cm of the bounding box are measured; the rest is infinitely far.
 
-    Args:
-        hands: keypoints of each, m, (T, 21, 3), NaN where not tracked.
-        pose: of the object, (T, 7), NaN where not tracked.
-        mesh: of the object, m.
+    Keypoints (m, (T, 21, 3)) and pose (T, 7) are NaN where not tracked.
     """
     near = np.full((len(hands), len(pose)), np.inf)
     seen = ~missing_frames(pose)
@@ -106,14 +103,7 @@ def busy_with(near: np.ndarray, touch: np.ndarray, fps: float) -> np.ndarray:
 
     Distances are averaged over 0.5 s, so that a finger that strays to a neighbour does
     not count; a touch of less than 0.3 s is none, or part of the touch beside it.
-
-    Args:
-        near: distance to each object, m, (O, T).
-        touch: (O, T) bool.
-        fps: frames a second.
-
-    Returns:
-        Object, -1 for none, (T,).
+    Distances (m) and touches are (O, T); the result is the object, -1 for none, (T,).
     """
     size = max(round(BRIDGE_SECONDS * fps), 1)
     near = np.where(touch, near, LEAVE)

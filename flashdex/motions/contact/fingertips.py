@@ -31,13 +31,7 @@ def local_tips(keypoints: np.ndarray, pose: np.ndarray) -> np.ndarray:
 def tip_distances(
     keypoints: np.ndarray, pose: np.ndarray, mesh: trimesh.Trimesh
 ) -> np.ndarray:
-    """Unsigned distance of the human fingertips to an object's surface, m, (T, 5).
-
-    Args:
-        keypoints: m, world, (T, 21, 3).
-        pose: of the object, (T, 7).
-        mesh: of the object, m.
-    """
+    """Unsigned distance of the tips of :func:`local_tips` to a surface, m, (T, 5)."""
     tips = local_tips(keypoints, pose).reshape(-1, 3)
     return surface_distance(mesh, tips, step=SAMPLE_STEP).reshape(-1, 5)
 

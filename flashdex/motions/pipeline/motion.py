@@ -40,7 +40,7 @@ from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.repair.repair import repair
 from flashdex.motions.repair.segment import segment
 from flashdex.motions.retarget.residuals import RetargetWeights
-from flashdex.motions.retarget.starts import retarget
+from flashdex.motions.retarget.solver import retarget
 from flashdex.objects.asset import ObjectSettings, default_cache_dir, make_object
 from flashdex.objects.solid import make_slot_grid
 

@@ -58,12 +58,8 @@ def run_order(
     What was prepared before, with the same content, settings and code, comes from the
     cache: an interrupted preparation goes on where it was.
 
-    Args:
-        order: recordings and settings.
-        out: directory of the library; an older library there is replaced at the end.
-        workers: processes.
-        ray: use a Ray cluster in place of processes.
-        progress: show a bar; by default when standard error is a terminal.
+    An older library in ``out`` is replaced at the end. A Ray cluster may take the place
+    of processes; a bar is shown by default when standard error is a terminal.
 
     Returns:
         The library; ``report.csv`` in it has a row for every motion, rejected ones too.

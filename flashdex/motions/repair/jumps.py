@@ -16,11 +16,8 @@ JUMP_EVENTS = 5  # more make a motion useless
 def jump_steps(pose: np.ndarray, fps: float) -> np.ndarray:
     """Whether a track jumps from frame t to t + 1, (T - 1,) bool.
 
-    A jump is faster than 5 m/s or 30 rad/s, or 6 times the usual step.
-
-    Args:
-        pose: (T, 7), NaN where not tracked: a step from or to there is none.
-        fps: frames a second.
+    A jump is faster than 5 m/s or 30 rad/s, or 6 times the usual step. The pose (T, 7)
+    is NaN where not tracked: a step from or to there is none.
     """
     step, turn = _steps(pose, 1)
     return _impossible(step, turn, _usual(step), fps)
@@ -31,10 +28,6 @@ def outliers(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
 
     Where the frames before and after a run fit each other, the run is at fault. Longer
     runs, and jumps without a way back, are left alone: nobody knows which side is true.
-
-    Args:
-        pose: (T, 7), NaN where not tracked.
-        fps: frames a second.
     """
     step, turn = _steps(pose, 1)
     usual = _usual(step)

@@ -117,13 +117,7 @@ def _drop(demo: HumanDemo, share: float, found: list[Finding]) -> HumanDemo:
 
 
 def keep(demo: HumanDemo, sides: Sequence[Side], objects: list[int]) -> HumanDemo:
-    """A motion with some of its hands and objects only.
-
-    Args:
-        demo: the motion.
-        sides: hands to keep.
-        objects: places in ``demo.objects`` to keep, in their new order.
-    """
+    """A motion with some of its hands, and with objects by place in their new order."""
     used = {s: i for s, i in demo.hand_object.items() if s in sides and i in objects}
     return replace(
         demo,

@@ -38,8 +38,7 @@ def segment(demo: HumanDemo) -> tuple[list[HumanDemo], list[Finding]]:
     where a hand turns to another object, where an acting hand or a kept object was not
     tracked, and at its stillest point where it is too long.
 
-    Args:
-        demo: repaired, NaN in long gaps; not changed.
+    The session is repaired, with NaN in long gaps; it is not changed.
 
     Returns:
         Pieces ``<name>_<start>_<end>`` that share the table of the whole session, and

@@ -54,11 +54,7 @@ def measure_penetration(
 ) -> Penetration:
     """Pose hands and objects frame by frame and read the contacts.
 
-    Args:
-        model: from ``make_reference_scene``.
-        joint_pos: (T, 2, J).
-        poses: per slot (T, 7).
-        active: hands that count, (2,).
+    Joint positions are (T, 2, J), poses (T, 7) a slot; ``active`` are hands that count.
     """
     data = mujoco.MjData(model)
     owner = _owners(model)

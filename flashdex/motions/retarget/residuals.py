@@ -65,11 +65,8 @@ class Residuals:
     ) -> list[Part]:
         """All residuals (T, 2, R) with Jacobians (T, 2, R, J).
 
-        Args:
-            q: joint positions, (T, 2, J).
-            pose: of the links, as ``HandKinematics`` returns it.
-            frames: joint axes of that pose.
-            contact: whether contact and penetration count.
+        The pose of the links at q (T, 2, J) is as ``HandKinematics`` returns it; with
+        ``contact``, contact and penetration count.
         """
         spheres = frames.points(self.hand.spheres.link, self.hand.spheres.pos)
         parts = [

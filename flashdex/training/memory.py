@@ -384,5 +384,6 @@ def check_memory(
     if plan.tight:
         note = f" ({assumption(plan)})" if assumption(plan) else ""
         _LOG.warning("memory is tight: %s%s", used(plan, *plan.tight), note)
-    known = (p for p in POOLS if plan.need(p) and plan.machine.free(p) is not None)
+    free = plan.machine.free
+    known: list[Pool] = [p for p in POOLS if plan.need(p) and free(p) is not None]
     return f"memory: {', '.join(used(plan, pool) for pool in known)}"

@@ -21,6 +21,7 @@ from benchmarks.common.output import emit
 from benchmarks.env import add_recipe_options, compose_bench
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.algorithms.inputs import HandRows
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
@@ -172,6 +173,7 @@ def _make_block(
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
     rows = rows[chosen]
+    assert isinstance(learner.rows, HandRows)
     codec = learner.rows.codec
     pack = seconds_each(lambda: codec.pack(rows), learner.device, seconds=seconds)
     return codec.pack(rows), pack

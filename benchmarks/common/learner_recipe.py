@@ -10,6 +10,7 @@ import torch
 
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.algorithms.inputs import HandRows
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.recipe import Recipe, compose, expect_kind
 from flashdex.training.build import RunBuilder
@@ -82,9 +83,11 @@ def _one_update(learner: FlashSACLearner) -> dict[str, float]:
         call()
         times[phase] = time.perf_counter() - start
 
-    state, _ = learner.rows.codec.unpack(learner.buffer.draw())
-    clock("sample", lambda: learner.rows.codec.unpack(learner.buffer.draw()))
-    clock("assemble", lambda: learner.rows.assemble_rows(state))
+    rows = learner.rows
+    assert isinstance(rows, HandRows)
+    state, _ = rows.codec.unpack(learner.buffer.draw())
+    clock("sample", lambda: rows.codec.unpack(learner.buffer.draw()))
+    clock("assemble", lambda: rows.assemble_rows(state))
     clock("whole", learner.update)
     times["learn"] = times["whole"] - times["sample"] - times["assemble"]
     return times

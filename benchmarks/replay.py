@@ -27,6 +27,7 @@ from benchmarks.common.ceilings import (
 from benchmarks.common.library import describe_scene
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.algorithms.inputs import HandRows
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
@@ -173,6 +174,7 @@ def _make_block(
         td = env.reset_worlds(td["next", keys.DONE].squeeze(-1))
     rows: Any = torch.cat(found)  # pyright: ignore[reportCallIssue,reportArgumentType]
     chosen = torch.randint(len(rows), (PUSH,), generator=generator).to(learner.device)
+    assert isinstance(learner.rows, HandRows)
     rows, codec = rows[chosen], learner.rows.codec
     return codec.pack(rows), seconds_each(lambda: codec.pack(rows), seconds=seconds)
 

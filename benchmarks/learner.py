@@ -33,6 +33,7 @@ from benchmarks.common.ceilings import (
 from benchmarks.common.plain_flashsac import PlainLearner, read_batch
 from flashdex import keys
 from flashdex.algorithms.flashsac import FlashSACLearner
+from flashdex.algorithms.inputs import HandRows
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import FlashdexError
 from flashdex.modules.actor import FlashActor
@@ -287,11 +288,12 @@ def measure_recipe(
     learner = bench.make_learner(env)
     assert isinstance(learner, FlashSACLearner)
     _collect(env, learner, rows=ROWS_PER_BATCH * recipe.algo.batch_size)
-    codec, buffer = learner.rows.codec, learner.buffer
+    assert isinstance(learner.rows, HandRows)
+    rows, codec, buffer = learner.rows, learner.rows.codec, learner.buffer
     state, _ = codec.unpack(buffer.draw())
     calls: dict[str, Update] = {
         "sample": lambda: codec.unpack(buffer.draw()),
-        "assemble": lambda: learner.show_rows(state),
+        "assemble": lambda: rows.assemble_rows(state),
         "whole": learner.update,
     }
     _seconds(calls, rounds=2 * BURN_IN)

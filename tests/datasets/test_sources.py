@@ -11,7 +11,8 @@ from flashdex.datasets import get_source, list_recordings, source_names
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError, UnknownSourceError
-from flashdex.motions.pipeline.prepare import prepare
+from flashdex.motions.pipeline.motion import MotionSettings
+from flashdex.motions.pipeline.prepare import Order, run_order
 
 TOY = '''
 """Reads one made-up motion."""
@@ -55,8 +56,9 @@ def test_a_dataset_is_one_file(tmp_path, toy):
     assert "toy" in datasets.format_sources()
     with pytest.raises(UnknownSourceError, match=r"toy.*Did you mean 'toy'"):
         get_source("tooy")
-    made = {"cache_dir": tmp_path / "cache", "progress": False, "control_hz": 30.0}
-    library = prepare(toy, out=tmp_path / "library", **made)
+    settings = MotionSettings(cache_dir=tmp_path / "cache", control_hz=30.0)
+    order = Order(toy, SourceOptions(), settings)
+    library = run_order(order, tmp_path / "library", progress=False)
     (motion,) = library.manifest["motions"]
     assert motion["source"] == "toy"
 

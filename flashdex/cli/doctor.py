@@ -82,7 +82,7 @@ def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
     from flashdex.cli.memory_report import format_cards, format_plan, format_work
     from flashdex.recipe import Recipe, compose, expect_kind
     from flashdex.training.build import learner_device
-    from flashdex.training.memory import plan_memory
+    from flashdex.training.memory.plan import plan_memory
     from flashdex.training.run_dir import default_run_dir
 
     recipe = expect_kind(compose(name, overrides), Recipe, where="doctor")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from flashdex.system.machine import Machine, Pool
-from flashdex.training.memory import (
+from flashdex.training.memory.plan import (
     NAMES,
     POOLS,
     MemoryPlan,

@@ -32,9 +32,9 @@ from flashdex.training.baselines import score_baselines
 from flashdex.training.build import RunBuilder, learner_device
 from flashdex.training.checkpoint import EVALUATED, RESUMED
 from flashdex.training.evaluator import evaluate_motions
-from flashdex.training.memory import check_memory
+from flashdex.training.memory.plan import check_memory
+from flashdex.training.memory.stand_in import find_library
 from flashdex.training.session import SessionStart
-from flashdex.training.stand_in import find_library
 from flashdex.training.task import Task
 
 if TYPE_CHECKING:

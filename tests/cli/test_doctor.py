@@ -10,7 +10,7 @@ import pytest
 from flashdex.cli import doctor
 from flashdex.cli.main import main
 from flashdex.system.machine import Machine
-from flashdex.training import memory
+from flashdex.training.memory import plan as memory
 
 PAGE = Path(__file__).parents[2] / "docs" / "memory.md"
 GB = 10**9

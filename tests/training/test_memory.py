@@ -15,8 +15,8 @@ from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe
 from flashdex.system.machine import Machine
-from flashdex.training import memory
-from flashdex.training.memory import (
+from flashdex.training.memory import plan as memory
+from flashdex.training.memory.plan import (
     GPU_ALLOWANCE,
     MemoryPlan,
     check_memory,
@@ -26,8 +26,8 @@ from flashdex.training.memory import (
     plan_memory,
     round_down,
 )
-from flashdex.training.rehearsal import PeakMeter, tensor_bytes
-from flashdex.training.stand_in import Collection
+from flashdex.training.memory.rehearsal import PeakMeter, tensor_bytes
+from flashdex.training.memory.stand_in import Collection
 
 GB = 10**9
 ROOMY = Machine(gpu=None, host=100 * GB, disk=100 * GB)

@@ -10,7 +10,7 @@ from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.flashsac import make_actor, make_critic
 from flashdex.objectives.batch import FlashBatch
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.training.rehearsal import Networks, PeakMeter, flashsac_update
+from flashdex.training.memory.rehearsal import Networks, PeakMeter, flashsac_update
 
 FUTURE = (12, 10)
 SMALL = {"actor_width": 32, "critic_width": 48, "future_channels": [16, 16, 8]}

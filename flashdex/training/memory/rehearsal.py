@@ -41,7 +41,7 @@ from flashdex.replay.codec import row_bytes
 from flashdex.replay.disk import replay_of
 from flashdex.rollouts.recorder import EpisodeRecorder
 from flashdex.training.build import RunBuilder
-from flashdex.training.stand_in import Collection, StandIn
+from flashdex.training.memory.stand_in import Collection, StandIn
 
 _WORLDS, _BATCH = 2, 32
 _ADAM_STEP = 4  # bytes of Adam's own counter, one a parameter tensor

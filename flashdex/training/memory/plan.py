@@ -23,8 +23,8 @@ from flashdex.recipe import Recipe
 from flashdex.rollouts.recorder import LOOK_EVERY
 from flashdex.system.machine import Machine, Pool, look_at_machine
 from flashdex.training.build import learner_device
-from flashdex.training.rehearsal import Rehearsal
-from flashdex.training.stand_in import Collection, find_library
+from flashdex.training.memory.rehearsal import Rehearsal
+from flashdex.training.memory.stand_in import Collection, find_library
 
 _LOG = logging.getLogger(__name__)
 TIGHT = 0.9  # share of what is free

@@ -319,7 +319,10 @@ def unpickle(file: IO[bytes]) -> Any:
 def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
     if isinstance(item, StandIn):
         args = tuple(a if isinstance(a, type) else plain(a) for a in item.args)
-        return type(item).make(args, plain(item.state))
+        made = type(item).make(args, plain(item.state))
+        if isinstance(made, type):  # it may be an argument, but no value
+            raise ValueError("a bare class is not data")
+        return made
     if type(item) in CONTAINERS:
         return type(item)([plain(part) for part in item])
     if type(item) is dict:

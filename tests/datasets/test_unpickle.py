@@ -288,6 +288,11 @@ def test_a_hostile_file_is_refused_by_name(tmp_path, hide, protocol, function):
         b"cnumpy\nload\n.",
         b"cnumpy.core.multiarray\nfromfile\n.",
         b"ctorch\nload\n.",
+        b"ctorch\nFloatStorage\n.",  # only inside of a tensor's own file
+        b"cscipy.sparse.csc\nos\n.",
+        b"cscipy.sparse\nlinalg.spsolve\n.",
+        b"c__builtin__\nopen\n.",
+        b"cfunctools\npartial\n.",
         b"cscipy.sparse\nload_npz\n.",
         b"cchumpy.ch\nos\n.",
         b"cflashdex.motions.unpickle\nload_pickle\n.",
@@ -328,6 +333,19 @@ FLOATS = DTYPE % b"f8" + b"(I3\nS'<'\nNNNI-1\nI-1\nI0\ntb"
         b"ccopyreg\n_reconstructor\n(cbuiltins\nobject\ncbuiltins\nobject\nNtR.",
         b"cbuiltins\nbytes\n(I99999999999\ntR.",
         b"cbuiltins\nset\n.",
+        b"cbuiltins\nbytes\n((I1\nI2\nltR.",  # of numbers
+        b"ccollections\nOrderedDict\n(I7\ntR.",
+        # items for a class, for an array, and a dict that is none
+        b"ccollections\nOrderedDict\nS'make'\nI1\ns.",
+        ARRAY + b"S'a'\nI1\ns.",
+        b"ccollections\nOrderedDict\n(tR(dS'make'\nI1\nsb.",
+        b"ccopyreg\n_reconstructor\n(ccopyreg\n_reconstructor\ncbuiltins\nobject\nNtR.",
+        # a class where a value is wanted
+        b"cbuiltins\nset\n((lcnumpy\ndtype\natR.",
+        b"cnumpy.core.multiarray\nscalar\n(cnumpy\ndtype\nS'1'\ntR.",
+        b"ctorch._utils\n_rebuild_parameter\n(cnumpy\nndarray\ntR.",
+        # a state for a class by name of its slots
+        b"cnumpy\ndtype\n(N(dS'make'\nI1\nstb.",
         # a state for a class would change it for the next file
         b"cchumpy.ch\nCh\n(N(dS'value'\nI1\nstb.",
         b"cscipy.sparse.csc\ncsc_matrix\n(N(dS'toarray'\nI1\nstb.",

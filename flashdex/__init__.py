@@ -1,3 +1,131 @@
-"""Recorded human hand-object motions to robot-hand motions that hold in physics."""
+"""Recorded human hand-object motions to robot-hand trajectories that hold up in physics.
 
-__version__ = "0.1.0"
+What stands here is the public interface; everything else may move. Heavy packages are
+imported when a function is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from torchrl.envs import TransformedEnv
+
+    from flashdex.motions.library import MotionLibrary
+    from flashdex.recipe import Recipe, RunRecipe
+    from flashdex.training.loaded import Run, RunPolicy
+
+__all__ = ["compose", "load_library", "load_policy", "load_run", "make_env"]
+
+
+def compose(name: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
+    """Read a recipe, apply overrides as on the command line, and check it.
+
+    Args:
+        name: of a recipe (`flashdex ls`), or the path of a YAML file.
+        overrides: ``key=value``, ``~key`` or ``group=option``.
+
+    Raises:
+        RecipeError: everything wrong with it, at once.
+
+    Example:
+        >>> import flashdex
+        >>> flashdex.compose("quickstart", ["env.num_envs=4"]).env.num_envs
+        4
+    """
+    from flashdex.recipe import compose
+
+    return compose(name, list(overrides))
+
+
+def _tracking_recipe(recipe: RunRecipe | str | Path, *, where: str) -> Recipe:
+    from flashdex.recipe import Recipe, expect_kind
+
+    found = compose(recipe) if isinstance(recipe, str | Path) else recipe
+    return expect_kind(found, Recipe, where=where)
+
+
+def make_env(
+    recipe: RunRecipe | str | Path,
+    *,
+    num_envs: int | None = None,
+    seed: int | None = None,
+    evaluation: bool = False,
+) -> TransformedEnv:
+    """The tracking environment of a recipe with its observation transforms.
+
+    Actions are ``("left", "action")`` and ``("right", "action")``, (N, J) in [-1, 1];
+    rewards ``(side, "reward")``, (N, 1); the transforms add ``observation``, (N, D),
+    ``future``, (N, C, K), and ``group_mask``, (N, 2). Motions are prepared where the
+    recipe names a source and no library.
+
+    Args:
+        recipe: a recipe, or the name or path of one.
+        num_envs: worlds N; the recipe's number when None.
+        seed: of resets; the recipe's when None.
+        evaluation: no terminations, noise or assist; every episode begins at frame 0.
+
+    Raises:
+        FlashdexError: the recipe has mistakes, or its motions cannot be had.
+    """
+    from torchrl.envs import TransformedEnv
+
+    from flashdex.training.build import RunBuilder
+
+    builder = RunBuilder.from_recipe(_tracking_recipe(recipe, where="make_env"))
+    plain = builder.make_env(num_envs=num_envs, seed=seed, evaluation=evaluation)
+    env = TransformedEnv(plain)
+    for transform in builder.make_transforms(builder.bank):
+        env.append_transform(transform)
+    return env
+
+
+def load_library(source: RunRecipe | str | Path) -> MotionLibrary:
+    """Open a motion library.
+
+    Args:
+        source: folder of a prepared library, or a recipe, whose motions are prepared
+            where they are not yet and selected as it says.
+
+    Raises:
+        LibraryError: it is missing, incomplete or of another schema.
+    """
+    if isinstance(source, str | Path):
+        from flashdex.motions.library import MotionLibrary
+
+        return MotionLibrary.load(source)
+    from flashdex.training.build import load_library, select_motions
+
+    recipe = _tracking_recipe(source, where="load_library")
+    return select_motions(load_library(recipe), recipe)
+
+
+def load_run(run_dir: str | Path) -> Run:
+    """Open a run for reading: recipe, attempts, metrics, rollouts, policy.
+
+    Raises:
+        RunError: the folder holds no run.
+    """
+    from flashdex.training.loaded import Run
+
+    run = Run(Path(run_dir))
+    _ = run.recipe  # says at once whether there is one
+    return run
+
+
+def load_policy(run: Run | str | Path) -> RunPolicy:
+    """The newest policy of a run as a TensorDict module.
+
+    It reads the compact state, which every environment of `make_env` emits, and writes
+    the actions of both hands.
+
+    Args:
+        run: from `load_run`, or its folder.
+
+    Raises:
+        RunError: there is no run, or no checkpoint that can be read.
+    """
+    opened = load_run(run) if isinstance(run, str | Path) else run
+    return cast("Run", opened).policy()

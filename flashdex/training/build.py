@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torchrl.envs.transforms import Transform
 
 from flashdex import keys
 from flashdex.algorithms import find_algorithm
@@ -252,6 +253,15 @@ class RunBuilder:
         lead[:, NUM_WRIST_JOINTS:] = 0.0
         return lead
 
+    def make_transforms(self, bank: ReferenceBank) -> list[Transform]:
+        """Build the observation transforms of the recipe on the bank's device."""
+        return make_transforms(
+            self.recipe.env.transforms,
+            bank,
+            self.hands,
+            reference_offset=self.recipe.env.reference_offset,
+        )
+
     def make_learner(self, env: TrackingEnv) -> Learner:
         """Build the recipe's algorithm for an environment's states.
 
@@ -260,12 +270,6 @@ class RunBuilder:
         """
         recipe, device = self.recipe, learner_device(self.recipe)
         bank = self.bank_on(device)
-        transforms = make_transforms(
-            recipe.env.transforms,
-            bank,
-            self.hands,
-            reference_offset=recipe.env.reference_offset,
-        )
         spec = TaskSpec(
             example=env.reset().to(device),
             action_dim=bank.num_joints,
@@ -273,7 +277,7 @@ class RunBuilder:
             seed=recipe.seed,
             device=device,
             bank=bank,
-            transforms=transforms,
+            transforms=self.make_transforms(bank),
         )
         return find_algorithm(recipe.algo.kind)(recipe.algo, spec)
 

@@ -101,18 +101,29 @@ def evaluate(run: str | Path, overrides: list[str] | None = None) -> dict[str, A
     Returns:
         What is written to ``evaluation.json`` in the run.
     """
-    run_dir = Path(run)
+    task, learner, env_steps = load_learner(Path(run), overrides)
+    _set_up_process(task.recipe)
+    result = task.evaluate(learner, env_steps)
+    write_atomic(Path(run) / "evaluation.json", json.dumps(result, indent=1))
+    return result
+
+
+def load_learner(
+    run_dir: Path, overrides: list[str] | None = None
+) -> tuple[Task, Learner, int]:
+    """The task of a run, its learner as it was stored last, and its env steps.
+
+    Raises:
+        RunError: the folder holds no run, or none with a checkpoint that can be read.
+    """
     recipe = load_run_recipe(run_dir, overrides)
     state = load_checkpoint(run_dir, task_of(recipe).evaluated_keys)
     task = task_of(recipe).open(recipe)
-    _set_up_process(recipe)
     # The learner keeps a running return a world: as many as it was trained with.
     num_envs = stored_value(_stored_recipe(run_dir, state), task.worlds_key)
     learner = task.make_learner(task.make_env(num_envs=num_envs))
     restore(learner, state, worlds_key=task.worlds_key)
-    result = task.evaluate(learner, state["env_steps"])
-    write_atomic(run_dir / "evaluation.json", json.dumps(result, indent=1))
-    return result
+    return task, learner, state["env_steps"]
 
 
 def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> RunRecipe:

@@ -2,9 +2,9 @@
 
     python examples/03_own_reward_and_observation.py [key=value ...]
 
-A term is a function whose keyword-only arguments are its options; a recipe then names it
-like those that ship. In a package of your own it needs no registering: a recipe names it
-by `_target_` and the command allows the package (docs/extend.md).
+A term is a function whose keyword-only arguments are its options; a recipe then names
+it like those that ship. In a package of your own it needs no registering: a recipe
+names it by `_target_`, and the command allows the package (docs/extend.md).
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Recorded human hand-object motions to robot-hand trajectories that hold up in physics.
+"""Recorded hand-object motions to robot-hand trajectories that hold up in physics.
 
 What stands here is the public interface; everything else may move. Heavy packages are
 imported when a function is called.
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from flashdex.recipe import Recipe, RunRecipe
     from flashdex.training.loaded import Run, RunPolicy
 
+__version__ = "0.1.0"
 __all__ = ["compose", "load_library", "load_policy", "load_run", "make_env"]
 
 

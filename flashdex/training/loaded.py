@@ -37,7 +37,8 @@ class RunPolicy(TensorDictModuleBase):
     def __init__(self, learner: Learner) -> None:
         super().__init__()
         self.in_keys = [*keys.STATE, keys.ATTEMPT]
-        self.out_keys = [keys.action(side) for side in keys.SIDES]
+        actions: list[Any] = [keys.action(side) for side in keys.SIDES]
+        self.out_keys = actions
         self.learner = learner
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -19,8 +19,8 @@ from flashdex.recipe.schema import Expectation, RunRecipe
 PAGE = Path(__file__).parent / "options.md"
 HEAD = """# Every option
 
-Made by `python docs/make_options.py` from the dataclasses in `flashdex/recipe/`, which
-are the one place of defaults; a test fails when this page is not up to date. How a
+Made by `python docs/make_options.py` from the config dataclasses and the registered terms,
+which are the one place of defaults; a test fails when this page is not up to date. How a
 recipe is put together stands on the page [recipes](recipes.md).
 
 Metres, radians, seconds, kilograms, unless a unit is given.

@@ -74,7 +74,7 @@ def test_worlds_agree_with_environments_stepped_by_hand(env_id):
         ends["truncated"] += sum(only)
         td = step
         if step["done"].any():
-            td = worlds.restart(step["done"].squeeze(-1))
+            td = worlds.reset_worlds(step["done"].squeeze(-1))
             after = td["observation"]
             for i, env in enumerate(hand):
                 is_new = terminated[i] or truncated[i]

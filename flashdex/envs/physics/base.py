@@ -25,18 +25,12 @@ class RawState:
     """What a rollout stores of the worlds, in the engine's own precision.
 
     The tensors may be views of the engine's memory: clone what is kept.
-
-    Attributes:
-        qpos: (N, nq), MuJoCo's layout of ``scenes``.
-        qvel: (N, nv).
-        ctrl: (N, nu).
-        wrench: force and torque on each object slot in the last substep, world axes,
-            (N, O, 6).
     """
 
-    qpos: Tensor
-    qvel: Tensor
-    ctrl: Tensor
+    qpos: Tensor  # (N, nq), MuJoCo's layout of ``scenes``
+    qvel: Tensor  # (N, nv)
+    ctrl: Tensor  # (N, nu)
+    # force and torque on each object slot in the last substep, world axes, (N, O, 6)
     wrench: Tensor
 
 
@@ -46,41 +40,26 @@ class Physics(Protocol):
     States are exchanged in the layout of ``flashdex.keys``: both hands and all
     object slots are always present; what a world lacks is zero (identity pose). All
     tensors are float32 on ``device``, and no call waits for the device.
-
-    Attributes:
-        num_envs: worlds N.
-        device: where states live.
-        decimation: substeps of a control step.
-        step_dt: control step, s.
-        scenes: scene of each motion, of one layout.
     """
 
-    num_envs: int
-    device: torch.device
-    decimation: int
-    step_dt: float
-    scenes: list[Scene]
+    num_envs: int  # worlds N
+    device: torch.device  # where states live
+    decimation: int  # substeps of a control step
+    step_dt: float  # control step, s
+    scenes: list[Scene]  # scene of each motion, of one layout
 
     def reset(
         self,
-        mask: Tensor,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
+        mask: Tensor,  # worlds to reset, (N,) bool
+        motion: Tensor,  # motion rows, (N,)
+        joint_pos: Tensor,  # (N, 2, J) m and rad
+        joint_vel: Tensor,  # (N, 2, J)
+        object_pose: Tensor,  # (N, O, 7), world
+        object_vel: Tensor,  # (N, O, 6), linear and angular, world
     ) -> None:
         """Put the worlds of ``mask`` into the given states of their motions.
 
         All arguments have a row a world; the rows of other worlds are ignored.
-
-        Args:
-            mask: worlds to reset, (N,) bool.
-            motion: motion rows, (N,).
-            joint_pos: (N, 2, J) m and rad.
-            joint_vel: (N, 2, J).
-            object_pose: (N, O, 7), world.
-            object_vel: (N, O, 6), linear and angular, world.
         """
         ...
 

@@ -114,20 +114,13 @@ class StateMap(nn.Module):
 
     def write(
         self,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
+        motion: Tensor,  # motion rows, (N,)
+        joint_pos: Tensor,  # (N, 2, J)
+        joint_vel: Tensor,  # (N, 2, J)
+        object_pose: Tensor,  # (N, O, 7), world
+        object_vel: Tensor,  # (N, O, 6), world
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Flat states of all worlds, float64; the inverse of ``read``.
-
-        Args:
-            motion: motion rows, (N,).
-            joint_pos: (N, 2, J).
-            joint_vel: (N, 2, J).
-            object_pose: (N, O, 7), world.
-            object_vel: (N, O, 6), world.
 
         Returns:
             qpos (N, nq), qvel (N, nv), and ctrl (N, nu) that holds the joints there.

@@ -25,36 +25,21 @@ GRAVITY = 9.81  # m/s2
 
 @dataclass(frozen=True)
 class ObjectWrench:
-    """Assist and hold of all worlds during one control step.
+    """Assist and hold of all worlds during one control step."""
 
-    Attributes:
-        ref_pose: reference position and quaternion, world, (N, O, 7).
-        ref_vel: reference linear and angular velocity, world, (N, O, 6).
-        mass: kg, (N, O).
-        inertia: about the centre of mass, object axes, kg m2, (N, O, 3, 3).
-        present: the slot holds an object, (N, O) bool.
-        hold: share of the hold after a reset, 0..1, (N,).
-        kp: assist stiffness, N/m, (N,).
-        kv: assist damping, N s/m, (N,).
-        hold_stiffness: natural frequency of the hold, rad/s.
-        torque_ratio: angular over linear stiffness of the assist.
-        force_limit: of the assist, each component, N.
-        torque_limit: of the assist, each component, N m.
-        assists: any world has assist gains; without them the term is left out.
-    """
-
-    ref_pose: Tensor
-    ref_vel: Tensor
-    mass: Tensor
-    inertia: Tensor
-    present: Tensor
-    hold: Tensor
-    kp: Tensor
-    kv: Tensor
-    hold_stiffness: float
-    torque_ratio: float
-    force_limit: float
-    torque_limit: float
+    ref_pose: Tensor  # reference position and quaternion, world, (N, O, 7)
+    ref_vel: Tensor  # reference linear and angular velocity, world, (N, O, 6)
+    mass: Tensor  # kg, (N, O)
+    inertia: Tensor  # about the centre of mass, object axes, kg m2, (N, O, 3, 3)
+    present: Tensor  # the slot holds an object, (N, O) bool
+    hold: Tensor  # share of the hold after a reset, 0..1, (N,)
+    kp: Tensor  # assist stiffness, N/m, (N,)
+    kv: Tensor  # assist damping, N s/m, (N,)
+    hold_stiffness: float  # natural frequency of the hold, rad/s
+    torque_ratio: float  # angular over linear stiffness of the assist
+    force_limit: float  # of the assist, each component, N
+    torque_limit: float  # of the assist, each component, N m
+    # any world has assist gains; without them the term is left out
     assists: bool = True
 
     def __call__(self, pose: Tensor, vel: Tensor) -> Tensor:

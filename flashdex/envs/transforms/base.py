@@ -69,19 +69,12 @@ class StateTransform(Transform):
 
 @dataclass(frozen=True)
 class BlockContext:
-    """What observation transforms are made from.
+    """What observation transforms are made from."""
 
-    Attributes:
-        name: of the block in the recipe.
-        bank: reference frames and object tables.
-        hands: hand specs by side.
-        reference_offset: ``env.reference_offset`` of the recipe.
-    """
-
-    name: str
-    bank: ReferenceBank
-    hands: dict[keys.Side, HandSpec]
-    reference_offset: int
+    name: str  # of the block in the recipe
+    bank: ReferenceBank  # reference frames and object tables
+    hands: dict[keys.Side, HandSpec]  # hand specs by side
+    reference_offset: int  # ``env.reference_offset`` of the recipe
 
     @property
     def used_hands(self) -> slice:

@@ -74,24 +74,16 @@ class RecordingFacts:
     """One row of ``report.csv``.
 
     Names and reasons come from the files that were read: show them escaped only.
-
-    Args:
-        name: of the motion.
-        status: one of ``STATUSES``.
-        reason: codes with their text.
-        figures: every other column, as written.
-        row: of the library, None when it is not in it.
-        source: dataset.
-        licence: of the dataset, empty when not known.
     """
 
-    name: str
-    status: str
-    reason: str
+    name: str  # of the motion
+    status: str  # one of ``STATUSES``
+    reason: str  # codes with their text
+    # every other column, as written
     figures: Mapping[str, str] = field(default_factory=dict)
-    row: int | None = None
-    source: str = ""
-    licence: str = ""
+    row: int | None = None  # of the library, None when it is not in it
+    source: str = ""  # dataset
+    licence: str = ""  # of the dataset, empty when not known
 
     @property
     def codes(self) -> list[str]:

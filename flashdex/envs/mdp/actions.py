@@ -20,13 +20,9 @@ def lowpass_alpha(cutoff_hz: float, step_dt: float) -> float:
 
 
 def lowpass(previous: Tensor, action: Tensor, fresh: Tensor, *, alpha: float) -> Tensor:
-    """Exponential low-pass; the first step after a reset passes through.
+    """Exponential low-pass of wrist actions, (N, 2, 6); ``alpha`` weighs the new value.
 
-    Args:
-        previous: filter state, (N, 2, 6).
-        action: wrist action, (N, 2, 6).
-        fresh: worlds that were just reset, (N,) bool.
-        alpha: weight of the new value.
+    In ``fresh`` worlds, (N,) bool, which were just reset, the action passes through.
     """
     filtered = previous + alpha * (action - previous)
     return torch.where(fresh[:, None, None], action, filtered)

@@ -59,12 +59,7 @@ def draw_reset(
 def reset_state(
     draw: ResetDraw, bank: ReferenceBank, joint_range: Tensor
 ) -> dict[str, Tensor]:
-    """Turn a draw into the physical state of n worlds.
-
-    Args:
-        draw: motions, frames and noise.
-        bank: reference frames.
-        joint_range: (2, J, 2); start positions are clamped to it.
+    """Turn a draw into the physical state of n worlds, within the ranges (2, J, 2).
 
     Returns:
         joint_pos, joint_vel (n, 2, J), object_pose (n, O, 7), object_vel (n, O, 6).

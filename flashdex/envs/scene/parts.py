@@ -158,10 +158,7 @@ def _add_grain(
 def add_supports(spec: mujoco.MjSpec, discs: Tensor, physics: PhysicsConfig) -> None:
     """Add the discs that objects rest on.
 
-    Args:
-        spec: scene under construction.
-        discs: [x, y, z_top, radius, height] in m, world; NaN unused, (S, 5).
-        physics: friction, and whether hands meet supports.
+    Of each disc [x, y, z_top, radius, height] in m, world; NaN is unused, (S, 5).
     """
     # Objects meet the support (2 & 2); hands do only when the recipe says so.
     bits = (1, 3) if physics.hand_support_contact else (0, 2)

@@ -23,24 +23,12 @@ OUTPUTS = (keys.OBSERVATION, keys.FUTURE, keys.GROUP_MASK)
 _INTERMEDIATES = (keys.KIN, keys.REF, keys.OWN, keys.BLOCKS)
 
 _KIN_FIELDS = (
-    "wrist_pos",
-    "wrist_quat",
-    "wrist_linvel",
-    "wrist_angvel",
-    "link_pos",
-    "link_quat",
-    "link_linvel",
-    "tip_pos",
-    "tip_center",
-    "tip_linvel",
+    *("wrist_pos", "wrist_quat", "wrist_linvel", "wrist_angvel"),
+    *("link_pos", "link_quat", "link_linvel", "tip_pos", "tip_center", "tip_linvel"),
 )
 _REF_FIELDS = (
-    "link_pos",
-    "link_linvel",
-    "tip_pos",
-    "tip_linvel",
-    "own_pos",
-    "own_quat",
+    *("link_pos", "link_linvel", "tip_pos", "tip_linvel"),
+    *("own_pos", "own_quat"),
 )
 
 

@@ -89,9 +89,6 @@ class Block(StateTransform):
     Subclasses write ``features`` (N, 2, D); hands without a part in the motion and,
     where ``needs_object`` is set, hands without an object get zeros. A hand that no
     motion of the collection uses is left out.
-
-    Args:
-        context: what it is made from.
     """
 
     needs_object = False
@@ -118,13 +115,7 @@ class Block(StateTransform):
 
 
 class FunctionBlock(Block):
-    """A block whose features are those of a registered function.
-
-    Args:
-        context: what it is made from.
-        term: the function, and what it declares.
-        options: values of its options.
-    """
+    """A block whose features are those of a registered function."""
 
     def __init__(
         self, context: BlockContext, term: Term, options: dict[str, Any]

@@ -46,11 +46,7 @@ def reference_delta(
 
 @observation("reference_delta")
 class ReferenceDelta(Block):
-    """Next reference minus robot and object.
-
-    Args:
-        context: the hands, for the mapped links.
-    """
+    """Next reference minus robot and object."""
 
     links: Tensor  # (2, Q)
 

@@ -62,11 +62,7 @@ def _query(
 
 @observation("surface_distance", needs_object=True)
 class SurfaceDistance(Block):
-    """Signed distance and surface normal at palm and fingertips.
-
-    Args:
-        context: holds the distance grids, and the hands for the fingertip radii.
-    """
+    """Signed distance and surface normal at palm and fingertips."""
 
     tip_radius: Tensor  # m, (2, 5)
 

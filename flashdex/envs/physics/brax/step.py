@@ -51,13 +51,8 @@ Advance = Callable[[Worlds, WrenchInputs, ArrayLike], Worlds]
 def make_advance(model: BraxModel, own_slot: Array) -> Advance:
     """Build the compiled function that advances all worlds by some substeps.
 
-    Args:
-        model: the system.
-        own_slot: object slot of each existing hand by motion, (M, S).
-
-    Returns:
-        Function of worlds, wrench inputs and the number of substeps, (), to worlds.
-        The number is not part of what is compiled: none, one and all use one program.
+    ``own_slot`` is the object slot of each existing hand by motion, (M, S). The number
+    of substeps is not part of what is compiled: none, one and all use one program.
     """
     blank = _blank_state(model)
 

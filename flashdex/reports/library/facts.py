@@ -93,12 +93,8 @@ class RecordingFacts:
     @property
     def badness(self) -> float:
         """Largest figure in units of the limit beyond which it flags a motion."""
-        shares = [
-            value / limit
-            for column, limit in LIMITS.items()
-            if (value := self.value(column)) is not None
-        ]
-        return max(shares, default=0.0)
+        found = [(self.value(column), limit) for column, limit in LIMITS.items()]
+        return max((v / limit for v, limit in found if v is not None), default=0.0)
 
     def value(self, column: str) -> float | None:
         """A column as a number; None when it is not there or not finite."""

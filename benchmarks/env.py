@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from torch.utils.benchmark import timer
 
 from benchmarks.common import output
@@ -42,7 +41,6 @@ def main(words: Sequence[str] = ()) -> dict[str, Any]:
         "overflow": env.physics.take_overflow(),
         **room_used(env),
         "memory_gb": memory_gb(env.device),
-        "torch_threads": torch.get_num_threads(),
     }
     return output.emit(result, out=args.out)
 

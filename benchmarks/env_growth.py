@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-import torch
 from torch.utils.benchmark import timer
 
 from benchmarks.common import output
@@ -86,7 +85,6 @@ def main(words: Sequence[str] = ()) -> None:
             "ratio": round(ratio, 3),
             "rounds": args.rounds,
             "seconds": round(timer() - begin, 1),
-            "torch_threads": torch.get_num_threads(),
         }
         output.emit(line, out=args.out)
 

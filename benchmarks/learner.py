@@ -277,10 +277,9 @@ def measure_recipe(
 ) -> dict[str, float | int]:
     """Build a recipe, collect rows by random actions and measure its updates.
 
-    Returns:
-        Milliseconds per update (medians): ``sample`` draws and unpacks replay rows,
-        ``assemble`` makes the observations of both window ends, ``learn`` is the update
-        itself, ``whole`` everything; and the width it was measured at.
+    Milliseconds an update (medians): ``sample`` draws and unpacks replay rows,
+    ``assemble`` makes the observations of both window ends, ``learn`` is the update
+    itself, ``whole`` everything; and the width it was measured at.
     """
     recipe = output.compose_tracking(name, ["algo.actor_delay=0", *overrides])
     bench = RunBuilder.from_recipe(recipe)
@@ -364,7 +363,6 @@ def _one_size(
         **{field: getattr(size, field) for field in names},
         **measure(size, rounds=rounds, device=device, **options),
         "memory_gb": memory_gb(device),
-        "torch_threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }
     if name == "quickstart" and device.type == "cpu":

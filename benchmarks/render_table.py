@@ -140,12 +140,6 @@ def _origin(lines: Sequence[Line]) -> str:
     return "; ".join(found) or "see the file"
 
 
-def read_lines(paths: Sequence[Path]) -> list[Line]:
-    """The JSON objects of some files, in order."""
-    texts = [path.read_text(encoding="utf-8") for path in paths]
-    return [json.loads(x) for text in texts for x in text.splitlines() if x.strip()]
-
-
 def replace_between(text: str, name: str, new: str) -> str:
     """A page with the text between the marks of a table replaced."""
     begin = f"<!-- table {name} -->"
@@ -167,7 +161,9 @@ def main() -> None:
         "--ratios", action="store_true", help="no rates: other work ran beside it"
     )
     args = parser.parse_args()
-    text = render(read_lines(args.files), rates=not args.ratios)
+    texts = [path.read_text(encoding="utf-8") for path in args.files]
+    lines = [json.loads(x) for text in texts for x in text.splitlines() if x.strip()]
+    text = render(lines, rates=not args.ratios)
     if args.into is None:
         print(text)
         return

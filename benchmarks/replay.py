@@ -101,7 +101,6 @@ def measure(recipe: Recipe, *, seconds: float) -> dict[str, Any]:
         "ceiling_table_rows": table,
         "share_of_gather": round(1e3 * gather / found["ms_sample"], 3),
         "copy_gb_per_s": copy_gb_per_s(kept_on, num_bytes=size, seconds=seconds),
-        "torch_threads": torch.get_num_threads(),
     }
 
 

@@ -105,7 +105,6 @@ def measure(
         "build_s": round(built, 2),
         "warm_up_s": round(warm, 2),
         **left,
-        "torch_threads": torch.get_num_threads(),
     }
 
 

@@ -32,11 +32,9 @@ def seconds_each(call: Callable[[], object], *, seconds: float) -> float:
 
 
 def memory_gb(device: torch.device) -> dict[str, float]:
-    """Memory in GB (1e9 bytes): the host's peak, torch's peak, all of the device.
+    """Memory in GB, 1e9 bytes: ``host_peak``, on a GPU ``torch_peak``, ``device_used``.
 
-    Returns:
-        ``host_peak``; on a GPU also ``torch_peak`` and ``device_used``, which is what
-        all processes and libraries hold at this moment, warp's arrays included.
+    The last is what all processes and libraries hold now, warp's arrays included.
     """
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = {"host_peak": peak * (1 if sys.platform == "darwin" else 1024)}

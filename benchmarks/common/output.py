@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchmarks.common.library import bench_library
 from flashdex.errors import FlashdexError
 from flashdex.recipe import Recipe, compose, expect_kind
@@ -63,8 +65,9 @@ def compose_tracking(name: str, overrides: Sequence[str]) -> Recipe:
 
 
 def emit(result: dict[str, Any], *, out: Path | None = None) -> dict[str, Any]:
-    """Print a result with hardware and commit, append it to a file, and return it."""
-    whole = {**result, "hardware": describe_machine(), "commit": describe_commit()}
+    """Print a result with what it was measured on, append it to a file, return it."""
+    whole = {**result, "torch_threads": torch.get_num_threads()}
+    whole |= {"hardware": describe_machine(), "commit": describe_commit()}
     print(json.dumps(whole), flush=True)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -138,12 +138,9 @@ class BareTurns(Turns):
 
 
 def measure(turns: Turns, *, seconds: float) -> dict[str, Any]:
-    """Let both take turns for some seconds, burn-in excluded.
+    """Let both take turns for some seconds, burn-in excluded; medians over turns.
 
-    Returns:
-        ``env_steps_per_s``, ``physics_env_steps_per_s``, ``ratio`` (medians over
-        turns), number of ``segments``; off the cpu engine ``warm_up_s`` of the first
-        turns.
+    Off the cpu engine there is ``warm_up_s`` of the first turns, too.
     """
     begin = timer()
     for _ in range(turns.burn_in):
@@ -178,9 +175,7 @@ def physics_rate(env: TrackingEnv, *, seconds: float, steps: int = 32) -> float:
 def room_used(env: TrackingEnv) -> dict[str, int]:
     """Contacts and constraint rows of the last substep, where the engine keeps them.
 
-    Returns:
-        ``nacon`` of all worlds and ``naconmax``, ``nefc`` of the fullest world and
-        ``njmax``; empty for engines without such numbers.
+    ``nacon`` is of all worlds, ``nefc`` of the fullest one.
     """
     data = getattr(env.physics, "data", None)
     found: dict[str, int] = {}

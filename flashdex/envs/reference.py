@@ -20,27 +20,18 @@ class ReferenceBank(nn.Module):
 
     Every per-frame quantity lies side by side in one wide table; reading the state
     of N worlds is a single ``index_select`` and a few views. Quantities of "the
-    object of a hand" are resolved here, once, so that no later code looks up slots.
-
-    Args:
-        library: the prepared motions.
-        hands: both sides of the robot hand, used for the mapped keypoints.
-
-    Attributes:
-        hand_active: hand takes part in the motion, (M, 2) bool.
-        used_hands: indices of the hands that any motion uses.
-        hand_slot: object slot of each hand, 0 where it has none, (M, 2) int64.
-        hand_object: object row of each hand, 0 where it has none, (M, 2) int64.
+    object of a hand" are resolved here, once, so that no later code looks up slots. The
+    hands are there for the mapped keypoints.
     """
 
     table: Tensor  # (F, all columns)
     future: Tensor  # (F, 2 * 45)
     start: Tensor  # (M,)
     length: Tensor  # (M,)
-    hand_active: Tensor  # (M, 2)
+    hand_active: Tensor  # hand takes part in the motion, (M, 2) bool
     has_object: Tensor  # (M, 2)
-    hand_slot: Tensor  # (M, 2)
-    hand_object: Tensor  # (M, 2)
+    hand_slot: Tensor  # object slot of each hand, 0 where it has none, (M, 2) int64
+    hand_object: Tensor  # object row of each hand, 0 where it has none, (M, 2) int64
     object_index: Tensor  # (M, O)
     points: Tensor  # object frame, m, (Q, P, 3)
     radius: Tensor  # m, (Q,)
@@ -105,13 +96,8 @@ class ReferenceBank(nn.Module):
     ) -> TensorDict:
         """Gather reference frames; frames past the end clamp to the last one.
 
-        Args:
-            motion: motion rows, any shape B, int64.
-            frame: frame within the motion, shape B, int64.
-            names: fields to return; all when empty.
-
-        Returns:
-            TensorDict of batch size B with the fields of the packed table.
+        Motion rows and frames within them have any shape B, int64. Returns the named
+        fields of the packed table, all when no name is given, batch B.
         """
         frame = torch.minimum(frame.clamp_min(0), self.length[motion] - 1)
         index = self.start[motion] + frame

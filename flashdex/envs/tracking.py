@@ -49,11 +49,7 @@ def few_threads(num_envs: int) -> Iterator[None]:
 def state_spec(num_envs: int, joints: int, slots: int, links: int) -> Composite:
     """Compact state of N worlds, as ``flashdex.keys`` lists it.
 
-    Args:
-        num_envs: worlds N.
-        joints: joints of a hand, wrist included.
-        slots: object slots of a world.
-        links: links of a hand.
+    Joints (wrist included) and links are those of one hand, slots those of a world.
     """
     n, whole = num_envs, torch.int64
     leaves = {

@@ -71,23 +71,15 @@ class Axis:
 
 
 def line_chart(
-    series: Sequence[Series],
+    series: Sequence[Series],  # curves
     *,
-    title: str,
-    x_label: str,
-    y_label: str = "",
-    is_step: bool = False,
-    y_range: tuple[float, float] | None = None,
+    title: str,  # heading above the axes; the label of y stands beside it
+    x_label: str,  # with its unit
+    y_label: str = "",  # with its unit
+    is_step: bool = False,  # hold each value until the next point, as counts want it
+    y_range: tuple[float, float] | None = None,  # values that are in sight in any case
 ) -> Markup:
     """Draw curves over one pair of axes; one without points is left out.
-
-    Args:
-        series: curves.
-        title: heading above the axes; the label of y stands beside it.
-        x_label: with its unit.
-        y_label: with its unit.
-        is_step: hold each value until the next point, as counts want it.
-        y_range: values that are in sight in any case.
 
     Returns:
         An ``<svg>`` element that scales with its container.

@@ -48,12 +48,7 @@ def shorten(text: str, width: int) -> str:
 
 
 def align(cells: Sequence[Sequence[str]], *, left: Sequence[int] = (0,)) -> list[str]:
-    """Lay rows out in columns.
-
-    Args:
-        cells: rows of equal length.
-        left: columns aligned to the left; the others are numbers.
-    """
+    """Lay rows of equal length out in columns: numbers, but those aligned ``left``."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
         " ".join(

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from flashdex.envs.mdp.assist import AssistConfig, AssistSchedule
-from flashdex.envs.scene.wrench import assist_wrench
+from flashdex.envs.scene.wrench import ObjectWrench
 
 GOOD = {"task": 1.0, "imitation": 1.0, "cloning": 1.0, "completion": 1.0}
 
@@ -18,18 +18,22 @@ def pose_of(pos, turn):
 
 
 def wrench(pose, vel, ref_pose, ref_vel, inertia, kp, kv, limit=50.0):
-    return assist_wrench(
-        pose[None, None].float(),
-        torch.as_tensor(vel)[None, None].float(),
-        ref_pose[None, None].float(),
-        torch.as_tensor(ref_vel)[None, None].float(),
-        torch.as_tensor(inertia)[None, None].float(),
-        torch.tensor([kp]),
-        torch.tensor([kv]),
+    acting = ObjectWrench(
+        ref_pose=ref_pose[None, None].float(),
+        ref_vel=torch.as_tensor(ref_vel)[None, None].float(),
+        mass=torch.ones(1, 1),
+        inertia=torch.as_tensor(inertia)[None, None].float(),
+        present=torch.ones(1, 1, dtype=torch.bool),
+        hold=torch.zeros(1),
+        kp=torch.tensor([kp]),
+        kv=torch.tensor([kv]),
+        hold_stiffness=0.0,
         torque_ratio=96.0,
         force_limit=limit,
         torque_limit=limit,
-    )[0, 0].numpy()
+    )
+    vel = torch.as_tensor(vel)[None, None].float()
+    return acting.pull(pose[None, None].float(), vel)[0, 0].numpy()
 
 
 @pytest.mark.parametrize("seed", range(5))

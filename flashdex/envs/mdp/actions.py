@@ -20,36 +20,25 @@ def lowpass_alpha(cutoff_hz: float, step_dt: float) -> float:
 
 
 def lowpass(previous: Tensor, action: Tensor, fresh: Tensor, *, alpha: float) -> Tensor:
-    """Exponential low-pass; the first step after a reset passes through.
+    """Exponential low-pass of wrist actions, (N, 2, 6); ``alpha`` weighs the new value.
 
-    Args:
-        previous: filter state, (N, 2, 6).
-        action: wrist action, (N, 2, 6).
-        fresh: worlds that were just reset, (N,) bool.
-        alpha: weight of the new value.
+    In ``fresh`` worlds, (N,) bool, which were just reset, the action passes through.
     """
     filtered = previous + alpha * (action - previous)
     return torch.where(fresh[:, None, None], action, filtered)
 
 
 def joint_target(
-    wrist: Tensor,
-    fingers: Tensor,
-    ref_joint_pos: Tensor,
-    joint_range: Tensor,
+    wrist: Tensor,  # filtered wrist action in [-1, 1], (N, 2, 6)
+    fingers: Tensor,  # finger action in [-1, 1], (N, 2, J - 6)
+    ref_joint_pos: Tensor,  # reference of the step, (N, 2, J)
+    joint_range: Tensor,  # lower and upper limits, (2, J, 2)
     *,
-    wrist_scale: Tensor,
+    wrist_scale: Tensor,  # m for slides, rad for hinges, (6,)
+    # rad a unit of residual; None maps [-1, 1] to the joint range
     finger_scale: float | None,
 ) -> Tensor:
     """Hybrid action: wrist residual on the reference, fingers absolute or residual.
-
-    Args:
-        wrist: filtered wrist action in [-1, 1], (N, 2, 6).
-        fingers: finger action in [-1, 1], (N, 2, J - 6).
-        ref_joint_pos: reference of the step, (N, 2, J).
-        joint_range: lower and upper limits, (2, J, 2).
-        wrist_scale: m for slides, rad for hinges, (6,).
-        finger_scale: rad a unit of residual; None maps [-1, 1] to the joint range.
 
     Returns:
         Position targets within the joint limits, (N, 2, J).

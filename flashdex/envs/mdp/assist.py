@@ -23,19 +23,12 @@ class AssistSchedule:
 
     The dial-back is evaluated before the gates and pops an explicit stack of levels,
     so that it can act; in the released code it stands behind a gate that excludes it.
-
-    Args:
-        config: gains, gates and periods.
-
-    Attributes:
-        upper: present (kp, kv).
-        lower: lower end of the per-world draw.
     """
 
     def __init__(self, config: AssistConfig) -> None:
         self.config = config
-        self.upper = (config.kp, config.kv)
-        self.lower = (config.kp, config.kv)
+        self.upper = (config.kp, config.kv)  # present gains
+        self.lower = (config.kp, config.kv)  # lower end of the per-world draw
         self._levels: list[tuple[tuple[float, float], tuple[float, float]]] = []
         self._history: deque[tuple[float, float, float, float]] = deque(
             maxlen=config.window_epochs
@@ -145,10 +138,8 @@ class AssistEpoch:
 
     Only assisted worlds count: attempt worlds have no assist, so their failures say
     nothing about it. Hands without a part in the motion are left out. What a step adds
-    stays on its device; the host waits for it once an epoch.
-
-    Args:
-        gates: the rewards that count, in order, and what for.
+    stays on its device; the host waits for it once an epoch. ``gates`` are the rewards
+    that count, in order, and what for.
     """
 
     def __init__(self, gates: Mapping[str, Gate]) -> None:

@@ -25,11 +25,7 @@ Bound = tuple[Term, Callable[[Step], Tensor]]
 class TermManager:
     """Rewards, and failures with the hands that are blamed for them.
 
-    Args:
-        context: what the terms are made from.
-        config: environment part of the recipe.
-        kinematics: forward kinematics of both hands.
-        evaluation: reward everything, but end nothing except on bad numbers.
+    An ``evaluation`` rewards everything, but ends nothing except on bad numbers.
     """
 
     def __init__(

@@ -15,43 +15,26 @@ from flashdex.system.fields import number
 
 @dataclass(frozen=True)
 class ResetDraw:
-    """What a reset of n worlds has drawn.
+    """What a reset of n worlds has drawn."""
 
-    Attributes:
-        motion: motion rows, (n,).
-        frame: start frames, (n,).
-        pos_noise: added to the joint positions, m and rad, (n, 2, J).
-        vel_noise: added to the wrist velocity, (n, 2, 6).
-        finger_vel: replaces the finger velocity, rad/s, (n, 2, J - 6); NaN keeps it.
-    """
-
-    motion: Tensor
-    frame: Tensor
-    pos_noise: Tensor
-    vel_noise: Tensor
+    motion: Tensor  # motion rows, (n,)
+    frame: Tensor  # start frames, (n,)
+    pos_noise: Tensor  # added to the joint positions, m and rad, (n, 2, J)
+    vel_noise: Tensor  # added to the wrist velocity, (n, 2, 6)
+    # replaces the finger velocity, rad/s, (n, 2, J - 6); NaN keeps it
     finger_vel: Tensor
 
 
 def draw_reset(
-    motion: Tensor,
-    from_start: Tensor,
-    noiseless: Tensor,
-    length: Tensor,
-    noise: ResetNoise,
-    joint_range: Tensor,
-    generator: torch.Generator,
+    motion: Tensor,  # motion rows, (n,)
+    from_start: Tensor,  # start at frame 0, (n,) bool
+    noiseless: Tensor,  # no noise, reference velocities, (n,) bool
+    length: Tensor,  # frames of each motion, (n,)
+    noise: ResetNoise,  # standard deviations
+    joint_range: Tensor,  # (2, J, 2)
+    generator: torch.Generator,  # source of randomness
 ) -> ResetDraw:
-    """Draw start frames and noise for n worlds.
-
-    Args:
-        motion: motion rows, (n,).
-        from_start: start at frame 0, (n,) bool.
-        noiseless: no noise, reference velocities, (n,) bool.
-        length: frames of each motion, (n,).
-        noise: standard deviations.
-        joint_range: (2, J, 2).
-        generator: source of randomness.
-    """
+    """Draw start frames and noise for n worlds."""
     n, joints = len(motion), joint_range.shape[1]
     frame = start_frames(length, generator)
     frame = torch.where(from_start, torch.zeros_like(frame), frame)
@@ -76,12 +59,7 @@ def draw_reset(
 def reset_state(
     draw: ResetDraw, bank: ReferenceBank, joint_range: Tensor
 ) -> dict[str, Tensor]:
-    """Turn a draw into the physical state of n worlds.
-
-    Args:
-        draw: motions, frames and noise.
-        bank: reference frames.
-        joint_range: (2, J, 2); start positions are clamped to it.
+    """Turn a draw into the physical state of n worlds, within the ranges (2, J, 2).
 
     Returns:
         joint_pos, joint_vel (n, 2, J), object_pose (n, O, 7), object_vel (n, O, 6).

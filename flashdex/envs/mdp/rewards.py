@@ -17,26 +17,18 @@ from flashdex.geometry.rotation import quat_angle, quat_to_matrix
 
 
 def object_points_error(
+    # surface points, already scaled to the common radius, object frame, m, (..., P, 3)
     points: Tensor,
-    pos: Tensor,
-    quat: Tensor,
-    ref_pos: Tensor,
-    ref_quat: Tensor,
+    pos: Tensor,  # simulated object position, world, m, (..., 3)
+    quat: Tensor,  # simulated object orientation, (..., 4)
+    ref_pos: Tensor,  # reference position, (..., 3)
+    ref_quat: Tensor,  # reference orientation, (..., 4)
     *,
-    top_k: int = 3,
+    top_k: int = 3,  # how many of the largest errors are averaged
 ) -> Tensor:
     """Eq. (6): mean of the k largest surface-point errors.
 
     ``e_obj = 1/k sum_{m in J_k} |T_cur p_m - T_ref p_m|``
-
-    Args:
-        points: surface points, already scaled to the common radius, object
-            frame, m, (..., P, 3).
-        pos: simulated object position, world, m, (..., 3).
-        quat: simulated object orientation, (..., 4).
-        ref_pos: reference position, (..., 3).
-        ref_quat: reference orientation, (..., 4).
-        top_k: how many of the largest errors are averaged.
 
     Returns:
         Error in metres, (...).
@@ -258,22 +250,16 @@ def failure(failed: Tensor) -> Tensor:
 
 
 def weighted_sum(
-    terms: dict[str, Tensor],
-    weights: dict[str, float],
+    terms: dict[str, Tensor],  # values of each term, (N, 2)
+    weights: dict[str, float],  # listed weights by term name
     *,
-    step_dt: float,
-    whole: Container[str] = ("failure",),
+    step_dt: float,  # control step, s
+    whole: Container[str] = ("failure",),  # terms whose weight is not halved
 ) -> Tensor:
     """Eq. (5) as released: ``r_h = dt sum_i w_i term_i``.
 
     Each hand gets half of every weight but those of failures, so that two hands add up
     to the listed value; a failure is charged in full to the hand that caused it.
-
-    Args:
-        terms: values of each term, (N, 2).
-        weights: listed weights by term name.
-        step_dt: control step, s.
-        whole: terms whose weight is not halved.
     """
     total = torch.zeros_like(next(iter(terms.values())))
     for name, value in terms.items():

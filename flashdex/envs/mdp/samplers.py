@@ -7,13 +7,7 @@ from torch import Tensor
 
 
 class MotionSampler:
-    """Draws motions; converted ones less often, but never not at all.
-
-    Args:
-        num_motions: motions in the collection.
-        converted_weight: weight of a converted motion against 1.
-        device: where rows are drawn.
-    """
+    """Draws motions; converted ones, of a weight below 1, less often, but never not."""
 
     def __init__(
         self,
@@ -45,11 +39,6 @@ SAMPLERS = {"uniform": 1.0, "unconverted": 0.25}
 
 
 def start_frames(length: Tensor, generator: torch.Generator) -> Tensor:
-    """Reference state initialisation: uniform in [0, .99 T), int64.
-
-    Args:
-        length: frames of the drawn motions, (n,).
-        generator: source of randomness.
-    """
+    """Reference state initialisation: uniform in [0, .99 T) of T frames, (n,) int64."""
     draw = torch.rand(length.shape, generator=generator, device=length.device)
     return (draw * 0.99 * length).long()

@@ -41,36 +41,23 @@ _TERMS: dict[Kind, dict[str, Term]] = {kind: {} for kind in KINDS}
 
 @dataclass(frozen=True, kw_only=True)
 class Term:
-    """One registered part of an environment and what it declares.
+    """One registered part of an environment and what it declares."""
 
-    Attributes:
-        kind: mapping of a recipe in which it is named.
-        name: by which it is named.
-        make: the decorated function or class.
-        about: what it is, one paragraph.
-        options: dataclass of its options; a reward's begin with its weight.
-        inputs: from what the function reads to its arguments; None passes it as it is.
-        needs_object: zero where the hand has no object.
-        gate: mean that the assist waits for.
-        off: off unless a recipe turns it on.
-        on_failure: a reward that reads the failures of its own step; its weight is
-            not shared between the hands.
-        in_evaluation: a termination that ends evaluations, too.
-        sums: gate of the reward that a termination cannot do without.
-    """
-
-    kind: Kind
-    name: str
-    make: Callable[..., Any]
-    about: str
-    options: type
+    kind: Kind  # mapping of a recipe in which it is named
+    name: str  # by which it is named
+    make: Callable[..., Any]  # the decorated function or class
+    about: str  # what it is, one paragraph
+    options: type  # dataclass of its options; a reward's begin with its weight
+    # from what the function reads to its arguments; None passes it as it is
     inputs: Callable[[Any], tuple[Any, ...]] | None = None
-    needs_object: bool = False
-    gate: Gate | None = None
-    off: bool = False
+    needs_object: bool = False  # zero where the hand has no object
+    gate: Gate | None = None  # mean that the assist waits for
+    off: bool = False  # off unless a recipe turns it on
+    # a reward that reads the failures of its own step; its weight is not shared between
+    # the hands
     on_failure: bool = False
-    in_evaluation: bool = False
-    sums: Gate | None = None
+    in_evaluation: bool = False  # a termination that ends evaluations, too
+    sums: Gate | None = None  # gate of the reward that a termination cannot do without
 
     @property
     def is_shipped(self) -> bool:

@@ -35,22 +35,15 @@ def early_reset_line(steps: Tensor, *, threshold: float, window: int) -> Tensor:
 
 
 def early_reset(
+    # sum of the raw object term (0..1 a step) since the reset, (N, 2)
     object_sum: Tensor,
-    steps: Tensor,
-    active: Tensor,
+    steps: Tensor,  # control steps since the reset, (N,)
+    active: Tensor,  # hands that take part, (N, 2) bool
     *,
-    threshold: float,
-    window: int,
+    threshold: float,  # mean reward demanded, 0.6
+    window: int,  # steps of one block, 5
 ) -> Tensor:
-    """Running object reward below the line; blames the hands below it themselves.
-
-    Args:
-        object_sum: sum of the raw object term (0..1 a step) since the reset, (N, 2).
-        steps: control steps since the reset, (N,).
-        active: hands that take part, (N, 2) bool.
-        threshold: mean reward demanded, 0.6.
-        window: steps of one block, 5.
-    """
+    """Running object reward below the line; blames the hands below it themselves."""
     line = early_reset_line(steps, threshold=threshold, window=window)
     weight = active.float()
     mean = (object_sum * weight).sum(-1) / weight.sum(-1).clamp_min(1.0)

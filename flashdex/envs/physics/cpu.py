@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import Engine, RawState
+from flashdex.envs.physics.base import Physics, RawState
 from flashdex.envs.scene.scene import Scene
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
@@ -35,8 +35,8 @@ _FULL = {
 }
 
 
-class CpuPhysics(Engine):
-    """``mujoco.batch`` with one model a motion; see ``Physics`` and ``Engine``."""
+class CpuPhysics(Physics):
+    """``mujoco.batch`` with one model a motion; see ``Physics``."""
 
     def __init__(
         self,
@@ -64,25 +64,15 @@ class CpuPhysics(Engine):
         self._full_before = self._count(list(_FULL.values()))
         self._full = np.zeros((num_envs, len(_FULL)), dtype=bool)
 
-    def reset(
-        self,
-        mask: Tensor,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
-    ) -> None:
-        """Put worlds into given states; see ``Physics.reset``."""
+    def _place(self, mask: Tensor, *state: Tensor) -> None:
         rows = mask.nonzero().squeeze(-1)
         ids = rows.numpy()
         if ids.size == 0:
             return
-        self._motion[rows] = motion[rows]
         self._note_overflow()  # the reset forgets it
         self._set_models(ids.tolist())
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        given = (motion, joint_pos, joint_vel, object_pose, object_vel)
+        given = (self._motion, *state)
         qpos, qvel, ctrl = self.map.write(*(x[rows] for x in given))
         self._qpos[rows], self._qvel[rows], self._ctrl[rows] = qpos, qvel, ctrl
         self.batch.forward(ids=ids)
@@ -123,7 +113,7 @@ class CpuPhysics(Engine):
         return RawState(self._qpos, self._qvel, self._ctrl, self._wrench)
 
     def take_overflow(self) -> dict[str, int]:
-        """Worlds whose arena was full since the last call; see the protocol."""
+        """Worlds whose arena was full since the last call; see ``Physics``."""
         self._note_overflow()
         worlds = self._full.sum(0).tolist()
         self._full[:] = False

@@ -19,12 +19,7 @@ class StateMap(nn.Module):
     """Reads and writes qpos, qvel and ctrl of N worlds of one scene layout.
 
     Hands that take no part in a world's motion are parked, empty object slots wait out
-    of reach; both read as zero (identity pose).
-
-    Args:
-        library: the collection, for what each motion uses.
-        hands: hand specs by side.
-        scene: any scene of the collection.
+    of reach; both read as zero (identity pose). Any scene of the collection will do.
     """
 
     qpos_of_joint: Tensor  # (S, J) columns, S sides that exist
@@ -71,12 +66,7 @@ class StateMap(nn.Module):
     def read(
         self, qpos: Tensor, qvel: Tensor, motion: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Joint and object states of all worlds, float32.
-
-        Args:
-            qpos: (N, nq).
-            qvel: (N, nv).
-            motion: motion rows, (N,).
+        """Joint and object states of N worlds, float32, of qpos (N, nq), qvel (N, nv).
 
         Returns:
             Joint positions and velocities, (N, 2, J); object poses (N, O, 7) and
@@ -114,20 +104,13 @@ class StateMap(nn.Module):
 
     def write(
         self,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
+        motion: Tensor,  # motion rows, (N,)
+        joint_pos: Tensor,  # (N, 2, J)
+        joint_vel: Tensor,  # (N, 2, J)
+        object_pose: Tensor,  # (N, O, 7), world
+        object_vel: Tensor,  # (N, O, 6), world
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Flat states of all worlds, float64; the inverse of ``read``.
-
-        Args:
-            motion: motion rows, (N,).
-            joint_pos: (N, 2, J).
-            joint_vel: (N, 2, J).
-            object_pose: (N, O, 7), world.
-            object_vel: (N, O, 6), world.
 
         Returns:
             qpos (N, nq), qvel (N, nv), and ctrl (N, nu) that holds the joints there.

@@ -72,23 +72,14 @@ def set_hand_friction(spec: mujoco.MjSpec, side: keys.Side, friction: float) -> 
 
 
 def add_object(
-    spec: mujoco.MjSpec,
-    library: MotionLibrary,
-    row: int,
-    slot: int,
-    num_parts: int,
-    physics: PhysicsConfig,
+    spec: mujoco.MjSpec,  # scene under construction
+    library: MotionLibrary,  # holds masses, inertias and convex parts
+    row: int,  # object row of the library, -1 for an empty slot
+    slot: int,  # object slot; the body is called ``object<slot>``
+    num_parts: int,  # geoms of this slot in every scene of the collection
+    physics: PhysicsConfig,  # friction and contact dimension
 ) -> None:
-    """Add the free body of one object slot, with exactly ``num_parts`` geoms.
-
-    Args:
-        spec: scene under construction.
-        library: holds masses, inertias and convex parts.
-        row: object row of the library, -1 for an empty slot.
-        slot: object slot; the body is called ``object<slot>``.
-        num_parts: geoms of this slot in every scene of the collection.
-        physics: friction and contact dimension.
-    """
+    """Add the free body of one object slot, with exactly ``num_parts`` geoms."""
     body = spec.worldbody.add_body(name=f"object{slot}")
     body.add_freejoint(name=f"object{slot}")
     parts = library.parts(row) if row >= 0 else []
@@ -167,10 +158,7 @@ def _add_grain(
 def add_supports(spec: mujoco.MjSpec, discs: Tensor, physics: PhysicsConfig) -> None:
     """Add the discs that objects rest on.
 
-    Args:
-        spec: scene under construction.
-        discs: [x, y, z_top, radius, height] in m, world; NaN unused, (S, 5).
-        physics: friction, and whether hands meet supports.
+    Of each disc [x, y, z_top, radius, height] in m, world; NaN is unused, (S, 5).
     """
     # Objects meet the support (2 & 2); hands do only when the recipe says so.
     bits = (1, 3) if physics.hand_support_contact else (0, 2)

@@ -38,19 +38,13 @@ PARKED = {"left": (-4.0, 0.0, 3.0), "right": (4.0, 0.0, 3.0)}  # m, idle hands
 
 @dataclass(frozen=True)
 class SceneLayout:
-    """What every scene of a collection contains.
+    """What every scene of a collection contains."""
 
-    Attributes:
-        sides: hands that any motion of the collection uses.
-        num_objects: object slots.
-        num_parts: convex parts of each slot, the largest count in the collection.
-        num_supports: support discs, the largest count in the collection.
-    """
-
-    sides: tuple[keys.Side, ...]
-    num_objects: int
+    sides: tuple[keys.Side, ...]  # hands that any motion of the collection uses
+    num_objects: int  # object slots
+    # convex parts of each slot, the largest count in the collection
     num_parts: tuple[int, ...]
-    num_supports: int
+    num_supports: int  # support discs, the largest count in the collection
 
     @classmethod
     def of(cls, library: MotionLibrary) -> SceneLayout:
@@ -72,17 +66,11 @@ class SceneLayout:
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled scene and where its quantities live.
+    """A compiled scene and where its quantities live."""
 
-    Attributes:
-        xml: self-contained MJCF text; the model is compiled from exactly this text.
-        layout: the layout shared by the collection.
-        hands: specs of both sides.
-    """
-
-    xml: str
-    layout: SceneLayout
-    hands: dict[keys.Side, HandSpec]
+    xml: str  # self-contained MJCF text; the model is compiled from exactly this text
+    layout: SceneLayout  # the layout shared by the collection
+    hands: dict[keys.Side, HandSpec]  # specs of both sides
 
     @cached_property
     def model(self) -> mujoco.MjModel:

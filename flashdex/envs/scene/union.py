@@ -37,17 +37,13 @@ _OWN = ("mesh_", "sensor_")
 
 @dataclass(frozen=True)
 class SceneUnion:
-    """The union of all scenes of a collection.
+    """The union of all scenes of a collection."""
 
-    Attributes:
-        model: compiled union; fields equal in all motions hold their value.
-        rows: fields that differ between motions, by name, (M, ...).
-        contact: addresses in sensordata of force and point of each link against the
-            own object of each hand, (M, S, L, 6).
-    """
-
+    # compiled union; fields equal in all motions hold their value
     model: mujoco.MjModel
-    rows: dict[str, np.ndarray]
+    rows: dict[str, np.ndarray]  # fields that differ between motions, by name, (M, ...)
+    # addresses in sensordata of force and point of each link against the own object of
+    # each hand, (M, S, L, 6)
     contact: np.ndarray
 
 

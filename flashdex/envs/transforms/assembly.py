@@ -23,24 +23,12 @@ OUTPUTS = (keys.OBSERVATION, keys.FUTURE, keys.GROUP_MASK)
 _INTERMEDIATES = (keys.KIN, keys.REF, keys.OWN, keys.BLOCKS)
 
 _KIN_FIELDS = (
-    "wrist_pos",
-    "wrist_quat",
-    "wrist_linvel",
-    "wrist_angvel",
-    "link_pos",
-    "link_quat",
-    "link_linvel",
-    "tip_pos",
-    "tip_center",
-    "tip_linvel",
+    *("wrist_pos", "wrist_quat", "wrist_linvel", "wrist_angvel"),
+    *("link_pos", "link_quat", "link_linvel", "tip_pos", "tip_center", "tip_linvel"),
 )
 _REF_FIELDS = (
-    "link_pos",
-    "link_linvel",
-    "tip_pos",
-    "tip_linvel",
-    "own_pos",
-    "own_quat",
+    *("link_pos", "link_linvel", "tip_pos", "tip_linvel"),
+    *("own_pos", "own_quat"),
 )
 
 
@@ -122,19 +110,14 @@ class ConcatBlocks(StateTransform):
 
 
 def make_transforms(
+    # ``env.transforms`` of the recipe: name to options, null = left out
     mapping: Mapping[str, Mapping[str, Any] | None],
-    bank: ReferenceBank,
-    hands: dict[keys.Side, HandSpec],
+    bank: ReferenceBank,  # reference frames and object tables
+    hands: dict[keys.Side, HandSpec],  # hand specs by side
     *,
-    reference_offset: int,
+    reference_offset: int,  # ``env.reference_offset`` of the recipe
 ) -> list[Transform]:
     """Build the observation transforms of a recipe in data-flow order.
-
-    Args:
-        mapping: ``env.transforms`` of the recipe: name to options, null = left out.
-        bank: reference frames and object tables.
-        hands: hand specs by side.
-        reference_offset: ``env.reference_offset`` of the recipe.
 
     Returns:
         Context, named blocks, concatenation. Clone them (``Transform.clone``) before

@@ -69,19 +69,12 @@ class StateTransform(Transform):
 
 @dataclass(frozen=True)
 class BlockContext:
-    """What observation transforms are made from.
+    """What observation transforms are made from."""
 
-    Attributes:
-        name: of the block in the recipe.
-        bank: reference frames and object tables.
-        hands: hand specs by side.
-        reference_offset: ``env.reference_offset`` of the recipe.
-    """
-
-    name: str
-    bank: ReferenceBank
-    hands: dict[keys.Side, HandSpec]
-    reference_offset: int
+    name: str  # of the block in the recipe
+    bank: ReferenceBank  # reference frames and object tables
+    hands: dict[keys.Side, HandSpec]  # hand specs by side
+    reference_offset: int  # ``env.reference_offset`` of the recipe
 
     @property
     def used_hands(self) -> slice:
@@ -96,9 +89,6 @@ class Block(StateTransform):
     Subclasses write ``features`` (N, 2, D); hands without a part in the motion and,
     where ``needs_object`` is set, hands without an object get zeros. A hand that no
     motion of the collection uses is left out.
-
-    Args:
-        context: what it is made from.
     """
 
     needs_object = False
@@ -125,13 +115,7 @@ class Block(StateTransform):
 
 
 class FunctionBlock(Block):
-    """A block whose features are those of a registered function.
-
-    Args:
-        context: what it is made from.
-        term: the function, and what it declares.
-        options: values of its options.
-    """
+    """A block whose features are those of a registered function."""
 
     def __init__(
         self, context: BlockContext, term: Term, options: dict[str, Any]

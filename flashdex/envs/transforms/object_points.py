@@ -18,20 +18,13 @@ from flashdex.geometry.rotation import (
 
 
 def object_points(
-    kin: TensorDictBase,
-    ref: TensorDictBase,
-    own_pos: Tensor,
-    own_quat: Tensor,
-    points: Tensor,
+    kin: TensorDictBase,  # forward kinematics
+    ref: TensorDictBase,  # reference frame shown to the policy
+    own_pos: Tensor,  # own object, world, m, (N, 2, 3)
+    own_quat: Tensor,  # own object, (N, 2, 4)
+    points: Tensor,  # object frame, m, (N, 2, P, 3)
 ) -> Tensor:
     """Eq. (3): surface points now, and their displacement to the next reference.
-
-    Args:
-        kin: forward kinematics.
-        ref: reference frame shown to the policy.
-        own_pos: own object, world, m, (N, 2, 3).
-        own_quat: own object, (N, 2, 4).
-        points: object frame, m, (N, 2, P, 3).
 
     Returns:
         Wrist frame, m, (N, 2, 6 P): points, then next reference minus current.

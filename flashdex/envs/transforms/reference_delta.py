@@ -13,20 +13,13 @@ from flashdex.geometry.rotation import quat_conj, quat_mul, quat_rotate_inverse
 
 
 def reference_delta(
-    kin: TensorDictBase,
-    ref: TensorDictBase,
-    own_pos: Tensor,
-    own_quat: Tensor,
-    links: Tensor,
+    kin: TensorDictBase,  # forward kinematics
+    ref: TensorDictBase,  # reference frame shown to the policy
+    own_pos: Tensor,  # own object, world, m, (N, 2, 3)
+    own_quat: Tensor,  # own object, (N, 2, 4)
+    links: Tensor,  # indices of the mapped links, (2, Q)
 ) -> Tensor:
     """Next reference minus robot: mapped links and tips (world), object (wrist).
-
-    Args:
-        kin: forward kinematics.
-        ref: reference frame shown to the policy.
-        own_pos: own object, world, m, (N, 2, 3).
-        own_quat: own object, (N, 2, 4).
-        links: indices of the mapped links, (2, Q).
 
     Returns:
         (N, 2, 6 (Q + 5) + 7).
@@ -53,11 +46,7 @@ def reference_delta(
 
 @observation("reference_delta")
 class ReferenceDelta(Block):
-    """Next reference minus robot and object.
-
-    Args:
-        context: the hands, for the mapped links.
-    """
+    """Next reference minus robot and object."""
 
     links: Tensor  # (2, Q)
 

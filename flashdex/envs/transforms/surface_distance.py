@@ -19,22 +19,14 @@ from flashdex.geometry.sdf import SdfGrid
 
 
 def fingertip_distance(
-    kin: TensorDictBase,
-    own_pos: Tensor,
-    own_quat: Tensor,
-    rows: Tensor,
-    sdf: SdfGrid,
-    tip_radius: Tensor,
+    kin: TensorDictBase,  # forward kinematics
+    own_pos: Tensor,  # own object, world, m, (N, 2, 3)
+    own_quat: Tensor,  # own object, (N, 2, 4)
+    rows: Tensor,  # object row of each hand, (N, 2)
+    sdf: SdfGrid,  # distance grids of all objects
+    tip_radius: Tensor,  # m, (2, 5)
 ) -> tuple[Tensor, Tensor]:
     """Eq. (7): signed distance of palm and fingertips to the own object.
-
-    Args:
-        kin: forward kinematics.
-        own_pos: own object, world, m, (N, 2, 3).
-        own_quat: own object, (N, 2, 4).
-        rows: object row of each hand, (N, 2).
-        sdf: distance grids of all objects.
-        tip_radius: m, (2, 5).
 
     Returns:
         Distances of palm, then tips, m, (N, 2, 6), and surface normals in the wrist
@@ -70,11 +62,7 @@ def _query(
 
 @observation("surface_distance", needs_object=True)
 class SurfaceDistance(Block):
-    """Signed distance and surface normal at palm and fingertips.
-
-    Args:
-        context: holds the distance grids, and the hands for the fingertip radii.
-    """
+    """Signed distance and surface normal at palm and fingertips."""
 
     tip_radius: Tensor  # m, (2, 5)
 

@@ -105,12 +105,7 @@ def _peak_chart(
 
 
 def contact_timeline(contact: NDArray[np.bool_], *, fps: float) -> Markup:
-    """Ten rows of bars: when each finger of each hand touches, as SVG.
-
-    Args:
-        contact: (T, 2, 5), hands [left, right], fingers thumb to pinky.
-        fps: frames a second.
-    """
+    """Ten rows of bars: when each finger of each hand touches, (T, 2, 5), as SVG."""
     axis = Axis.horizontal(0.0, max(len(contact) - 1, 1) / fps)
     height = (HEIGHT - TOP - BOTTOM) / (len(SIDES) * len(FINGERS))
     rows, bars = [], []

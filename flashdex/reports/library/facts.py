@@ -74,24 +74,16 @@ class RecordingFacts:
     """One row of ``report.csv``.
 
     Names and reasons come from the files that were read: show them escaped only.
-
-    Args:
-        name: of the motion.
-        status: one of ``STATUSES``.
-        reason: codes with their text.
-        figures: every other column, as written.
-        row: of the library, None when it is not in it.
-        source: dataset.
-        licence: of the dataset, empty when not known.
     """
 
-    name: str
-    status: str
-    reason: str
+    name: str  # of the motion
+    status: str  # one of ``STATUSES``
+    reason: str  # codes with their text
+    # every other column, as written
     figures: Mapping[str, str] = field(default_factory=dict)
-    row: int | None = None
-    source: str = ""
-    licence: str = ""
+    row: int | None = None  # of the library, None when it is not in it
+    source: str = ""  # dataset
+    licence: str = ""  # of the dataset, empty when not known
 
     @property
     def codes(self) -> list[str]:
@@ -101,12 +93,8 @@ class RecordingFacts:
     @property
     def badness(self) -> float:
         """Largest figure in units of the limit beyond which it flags a motion."""
-        shares = [
-            value / limit
-            for column, limit in LIMITS.items()
-            if (value := self.value(column)) is not None
-        ]
-        return max(shares, default=0.0)
+        found = [(self.value(column), limit) for column, limit in LIMITS.items()]
+        return max((v / limit for v, limit in found if v is not None), default=0.0)
 
     def value(self, column: str) -> float | None:
         """A column as a number; None when it is not there or not finite."""

@@ -40,23 +40,12 @@ def write_library_report(
 ) -> Path:
     """Write ``report.html``: what was kept, what was not and why, and how good it is.
 
-    Args:
-        library: the prepared collection.
-        path: the page; by default ``report.html`` in the library.
-        thumbnails: draw stills of the motions that have a card.
-        max_cards: motions with a card, flagged ones and the worst first; the table has
-            all recordings in any case.
-
-    Returns:
-        The page.
+    The page is ``report.html`` in the library by default. At most ``max_cards`` motions
+    have a card, flagged ones and the worst first, with stills when ``thumbnails`` says
+    so; the table has all recordings in any case.
 
     Raises:
         LibraryError: ``report.csv`` is not a table, or the page cannot be written.
-
-    Example:
-        >>> library = MotionLibrary.load("libraries/mine")  # doctest: +SKIP
-        >>> write_library_report(library)  # doctest: +SKIP
-        PosixPath('libraries/mine/report.html')
     """
     recordings = library_facts(library)
     inside = {one.row: one for one in recordings if one.row is not None}
@@ -116,11 +105,8 @@ LEGEND = (
 def summary_lines(library: MotionLibrary | Iterable[Mapping[str, Any]]) -> list[str]:
     """Totals by source, recordings by code, and the five worst motions.
 
-    Args:
-        library: a prepared collection, or rows as ``report.csv`` has them.
-
-    Returns:
-        Lines of printable characters only: names come from untrusted files.
+    Of a prepared collection, or of rows as ``report.csv`` has them. All characters are
+    printable: names come from untrusted files.
 
     Raises:
         LibraryError: ``report.csv`` of the library is not a table.

@@ -50,9 +50,8 @@ class Film:
 def draw_films(rollouts: list[Path]) -> str:
     """Draw what is not drawn yet of the stored rollouts of a run.
 
-    Returns:
-        Why pictures are missing, empty when all are there. Never raises: a run is worth
-        reporting without pictures.
+    Returns why pictures are missing, empty when all are there. Never raises: a run is
+    worth reporting without pictures.
     """
     todo = [r for r in rollouts if r.is_file() and not Film.of(r).is_newer_than(r)]
     if not todo:

@@ -27,9 +27,7 @@ Axes = tuple[np.ndarray, np.ndarray, np.ndarray]
 def view_axes(azimuth: float, elevation: float) -> Axes:
     """Directions forward, right and up of MuJoCo's free camera in the world, each (3,).
 
-    Args:
-        azimuth: deg.
-        elevation: deg, negative looks down.
+    Angles are in degrees; a negative elevation looks down.
     """
     a, e = math.radians(azimuth), math.radians(elevation)
     level = np.array([math.cos(a), math.sin(a), 0.0])
@@ -105,12 +103,10 @@ def dress_scene(spec: mujoco.MjSpec, *, width: int, height: int) -> mujoco.MjSpe
 
 
 class ScenePainter(ABC):
-    """Draws single frames of something that moves.
+    """Draws single frames of something that moves, ``size`` = (width, height) pixels.
 
-    Args:
-        spec: the scene; light and sky are added.
-        size: width and height of a picture, pixels.
-        middle: frame whose objects decide from which side to look.
+    Light and sky are added to the scene. The objects of the frame ``middle`` decide
+    from which side to look.
     """
 
     def __init__(

@@ -37,11 +37,10 @@ DISC = (0.8, 0.8, 0.78, 1.0)
 def draw_thumbnails(
     library: MotionLibrary, rows: Sequence[int]
 ) -> tuple[dict[int, bytes], str]:
-    """Draw a strip of stills of each of some motions, at ``still_frames``.
+    """Strips of stills of some motions, JPEG data by row, at ``still_frames``.
 
-    Returns:
-        JPEG data by motion row, and why pictures are missing, empty when all are there.
-        Never raises: a library is worth reporting without pictures.
+    And why pictures are missing, empty when all are there. Never raises: a library is
+    worth reporting without pictures.
     """
     backend = films.find_backend() if rows else None
     if backend is None:
@@ -80,11 +79,7 @@ def contact_of(library: MotionLibrary, row: int) -> np.ndarray:
 
 
 def still_frames(library: MotionLibrary, row: int) -> dict[str, int]:
-    """Frames worth a picture: start, first contact, middle, end.
-
-    Returns:
-        Four frames of the motion by word; without contact, a quarter stands in.
-    """
+    """Frames worth a picture: start, first contact (or a quarter), middle, end."""
     touched = np.flatnonzero(contact_of(library, row).any(axis=(1, 2)))
     length = int(library.motions["length"][row])
     first = {"contact": int(touched[0])} if len(touched) else {"quarter": length // 4}
@@ -93,10 +88,6 @@ def still_frames(library: MotionLibrary, row: int) -> dict[str, int]:
 
 class StillPainter(ScenePainter):
     """Draws single frames of a motion's reference, each as near as it may be.
-
-    Args:
-        library: the prepared collection.
-        row: motion.
 
     Raises:
         FlashdexError: the hand is unknown.

@@ -21,25 +21,16 @@ ATTEMPT_KEYS = ("motion", "converted", "errors", "env_steps", "wall_s")
 
 @dataclass(frozen=True)
 class RunData:
-    """The files of a run, as plain data.
+    """The files of a run, as plain data."""
 
-    Args:
-        path: run directory.
-        recipe: composed recipe.
-        versions: package versions, and hardware when it was recorded.
-        metrics: records of ``metrics.jsonl``; what a resumed run did again is left out.
-        attempts: lines of ``conversions.jsonl``, oldest first.
-        baselines: baseline -> motion -> score.
-        certificates: motion -> certificate, of stored rollouts.
-    """
-
-    path: Path
-    recipe: Line
-    versions: Line
+    path: Path  # run directory
+    recipe: Line  # composed recipe
+    versions: Line  # package versions, and hardware when it was recorded
+    # records of ``metrics.jsonl``; what a resumed run did again is left out
     metrics: list[Line]
-    attempts: list[Line]
-    baselines: dict[str, dict[str, Line]]
-    certificates: dict[str, Line]
+    attempts: list[Line]  # lines of ``conversions.jsonl``, oldest first
+    baselines: dict[str, dict[str, Line]]  # baseline -> motion -> score
+    certificates: dict[str, Line]  # motion -> certificate, of stored rollouts
 
     @property
     def criterion(self) -> str:
@@ -161,17 +152,11 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class MotionFacts:
-    """One row of the per-motion table: what the files of a run say about a motion.
+    """One row of the per-motion table: what the files of a run say about a motion."""
 
-    Args:
-        run: the files.
-        name: motion id.
-        lines: of the ledger, scored rollouts from frame 0, oldest first.
-    """
-
-    run: RunData
-    name: str
-    lines: list[Line]
+    run: RunData  # the files
+    name: str  # motion id
+    lines: list[Line]  # of the ledger, scored rollouts from frame 0, oldest first
 
     @cached_property
     def baselines(self) -> dict[str, Line]:

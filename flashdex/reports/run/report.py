@@ -29,20 +29,10 @@ Cell = tuple[str, str]  # text, and "good" or "bad" where it is marked
 
 
 def write_report(run_dir: str | Path) -> Path:
-    """Draw the films that are missing and write ``report.html``.
-
-    Args:
-        run_dir: run directory, finished or not.
-
-    Returns:
-        The page.
+    """Draw the films that are missing of a run, finished or not; write ``report.html``.
 
     Raises:
         RunError: this is no run directory, or it cannot be written.
-
-    Example:
-        >>> write_report("runs/quickstart-none-s0")  # doctest: +SKIP
-        PosixPath('runs/quickstart-none-s0/report.html')
     """
     run = load_run(run_dir)
     rows = motion_facts(run)

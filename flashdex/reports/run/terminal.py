@@ -45,13 +45,16 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     shown = f"  ablation {run.ablation}" if run.ablation else ""
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
-        f"engine {recipe.get('physics', {}).get('engine', '?')}  "
-        f"seed {recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
-        f"{duration(run.wall_s)}",
+        f"engine {recipe.get('physics', {}).get('engine', '?')}  {_progress(run)}",
         f"{counts['converted']}/{num_motions(run, rows)} converted by {run.criterion}, "
         f"{counts['certified']} certified ({counts['robust']} robust), "
         f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
     ]
+
+
+def _progress(run: RunData) -> str:
+    steps, spent = f"{run.env_steps:,} env steps", duration(run.wall_s)
+    return f"seed {run.recipe.get('seed', '?')}  {steps} in {spent}"
 
 
 def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
@@ -115,9 +118,8 @@ def evaluation_table(
 ) -> str:
     """Scores of ``flashdex evaluate`` for a terminal.
 
-    Args:
-        rows: one a motion: name, state of each criterion, errors in m and rad.
-        totals: counts of each criterion and mean errors.
+    Rows, one a motion, hold name, state of each criterion, errors in m and rad; the
+    totals hold counts of each criterion and mean errors.
     """
     names = [key for key, value in totals.items() if isinstance(value, Mapping)]
     cells = [["motion", *names, "mm", "deg"]]
@@ -155,9 +157,8 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
             f"{in_unit(q, verdict.limits[q]):g} {SHOWN[q][1]}"
             for q, value in verdict.values.items()
         ]
-        state = verdict.state.replace("_", " ")
         shown = ", ".join(parts) or verdict.reason
-        cells.append([verdict.name, state, shown])
+        cells.append([verdict.name, verdict.state.replace("_", " "), shown])
     return "\n".join([name, *align(cells, left=(0, 1, 2))])
 
 
@@ -175,18 +176,13 @@ def gym_run_table(run_dir: str | Path) -> str:
     """Return of the deterministic policy over env steps, newest last."""
     run = load_run(run_dir)
     env_id = run.recipe.get("gym", {}).get("env_id", "?")
-    head = (
-        f"{run.recipe.get('name', run.path.name)}  {env_id}  "
-        f"seed {run.recipe.get('seed', '?')}  {run.env_steps:,} env steps in "
-        f"{duration(run.wall_s)}"
-    )
+    head = f"{run.recipe.get('name', run.path.name)}  {env_id}  {_progress(run)}"
     found = [record for record in run.metrics if "eval/return" in record]
     if not found:
         return f"{head}\nnot evaluated yet; records: {run.path / 'metrics.jsonl'}"
     cells = [["env steps", "return", "std", "length"]]
     for r in found[-ROWS:]:
-        values = (r["eval/return"], r["eval/return_std"])
-        figures = [f"{value:.1f}" for value in values]
+        figures = [f"{r[f'eval/{name}']:.1f}" for name in ("return", "return_std")]
         cells.append([f"{int(r['env_steps']):,}", *figures, f"{r['eval/length']:.0f}"])
     lines = align(cells, left=())
     return "\n".join([head, "", *lines, "", f"records: {run.path / 'metrics.jsonl'}"])

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import Engine, RawState
+from flashdex.envs.physics.base import Physics, RawState
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError, MissingExtraError
 from flashdex.hands.spec import HandSpec
@@ -45,7 +45,7 @@ def brax_device() -> torch.device:
     return set_up()
 
 
-class BraxPhysics(Engine):
+class BraxPhysics(Physics):
     """brax's MJX pipeline on all worlds at once; see ``Physics``.
 
     The first step compiles for about a minute with one hand, longer with more; the
@@ -78,23 +78,11 @@ class BraxPhysics(Engine):
         self._worlds = code.empty_worlds(self.model, num_envs, slots)
         self._no_wrench = self._inputs(_no_wrench(num_envs, slots, self.device))
 
-    def reset(
-        self,
-        mask: Tensor,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
-    ) -> None:
-        """Put worlds into given states; see ``Physics.reset``."""
+    def _place(self, mask: Tensor, *state: Tensor) -> None:
         code = self._code
-        self._motion = torch.where(mask, motion.long(), self._motion)
-        state = self.map.write(
-            self._motion, joint_pos, joint_vel, object_pose, object_vel
-        )
         chosen = code.to_jax(mask)
-        flat = [code.to_jax(x) for x in (*state, self._motion)]
+        written = self.map.write(self._motion, *state)
+        flat = [code.to_jax(x) for x in (*written, self._motion)]
         placed = code.place(self._worlds, chosen, *flat)
         # Contacts at the new state: a substep whose motion is thrown away, and none
         # where no world is reset.
@@ -121,7 +109,7 @@ class BraxPhysics(Engine):
         return RawState(*[self._code.to_torch(x).clone() for x in parts])
 
     def take_overflow(self) -> dict[str, int]:
-        """Worlds that may have lost contacts since the last call; see the protocol.
+        """Worlds that may have lost contacts since the last call; see ``Physics``.
 
         MJX keeps the deepest contacts, as many as ``brax_model`` gives it room for. A
         world counts when every place was taken, so that one more would have been lost.

@@ -32,31 +32,20 @@ CONTACTS_PER_BODY = 16
 
 @dataclass(frozen=True)
 class BraxModel:
-    """One system, and tables of what motions and bodies are in it.
+    """One system, and tables of what motions and bodies are in it."""
 
-    Attributes:
-        system: all hands, objects and supports; the supports are the first motion's.
-        support_geoms: geom ids of the supports, (D,).
-        support_pos: centres by motion, world, m, (M, D, 3).
-        support_size: half sizes by motion, m, (M, D, 3).
-        link_of_geom: index of the link that owns a geom, -1 for others, (S, G).
-        slot_of_geom: object slot of a geom, -1 for others, (G,).
-        places: contacts kept of each contact dimension.
-        object_body: body of each object slot, (O',).
-        object_qpos: first column of each object in qpos, (O',).
-        object_dof: first column of each object in qvel, (O',).
-    """
-
+    # all hands, objects and supports; the supports are the first motion's
     system: System
-    support_geoms: np.ndarray
-    support_pos: Array
-    support_size: Array
+    support_geoms: np.ndarray  # geom ids of the supports, (D,)
+    support_pos: Array  # centres by motion, world, m, (M, D, 3)
+    support_size: Array  # half sizes by motion, m, (M, D, 3)
+    # index of the link that owns a geom, -1 for others, (S, G)
     link_of_geom: np.ndarray
-    slot_of_geom: np.ndarray
-    places: int
-    object_body: np.ndarray
-    object_qpos: np.ndarray
-    object_dof: np.ndarray
+    slot_of_geom: np.ndarray  # object slot of a geom, -1 for others, (G,)
+    places: int  # contacts kept of each contact dimension
+    object_body: np.ndarray  # body of each object slot, (O',)
+    object_qpos: np.ndarray  # first column of each object in qpos, (O',)
+    object_dof: np.ndarray  # first column of each object in qvel, (O',)
 
 
 def build_model(scenes: list[Scene]) -> BraxModel:

@@ -31,29 +31,18 @@ MAX_VALUE = 1e10  # MuJoCo's own bound of a usable number
 
 
 class Worlds(NamedTuple):
-    """State of N worlds; every array has a row a world.
+    """State of N worlds; every array has a row a world."""
 
-    Attributes:
-        qpos: (N, nq).
-        qvel: (N, nv).
-        ctrl: (N, nu).
-        warmstart: accelerations of the last substep, where the solver starts, (N, nv).
-        motion: motion rows, (N,) int32.
-        wrench: on each object in the last substep, world axes, (N, O, 6).
-        contact: net force and point on each link, world, (N, S, L, 6).
-        bad: numbers broke down since the last reset, (N,).
-        full: all places for contacts were taken, since last asked, (N,).
-    """
-
-    qpos: Array
-    qvel: Array
-    ctrl: Array
+    qpos: Array  # (N, nq)
+    qvel: Array  # (N, nv)
+    ctrl: Array  # (N, nu)
+    # accelerations of the last substep, where the solver starts, (N, nv)
     warmstart: Array
-    motion: Array
-    wrench: Array
-    contact: Array
-    bad: Array
-    full: Array
+    motion: Array  # motion rows, (N,) int32
+    wrench: Array  # on each object in the last substep, world axes, (N, O, 6)
+    contact: Array  # net force and point on each link, world, (N, S, L, 6)
+    bad: Array  # numbers broke down since the last reset, (N,)
+    full: Array  # all places for contacts were taken, since last asked, (N,)
 
 
 Advance = Callable[[Worlds, WrenchInputs, ArrayLike], Worlds]
@@ -62,13 +51,8 @@ Advance = Callable[[Worlds, WrenchInputs, ArrayLike], Worlds]
 def make_advance(model: BraxModel, own_slot: Array) -> Advance:
     """Build the compiled function that advances all worlds by some substeps.
 
-    Args:
-        model: the system.
-        own_slot: object slot of each existing hand by motion, (M, S).
-
-    Returns:
-        Function of worlds, wrench inputs and the number of substeps, (), to worlds.
-        The number is not part of what is compiled: none, one and all use one program.
+    ``own_slot`` is the object slot of each existing hand by motion, (M, S). The number
+    of substeps is not part of what is compiled: none, one and all use one program.
     """
     blank = _blank_state(model)
 

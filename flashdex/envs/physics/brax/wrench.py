@@ -14,7 +14,7 @@ from brax import math
 from jax import Array
 from torch import Tensor
 
-from flashdex.envs.scene.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import LIMITS, ObjectWrench
 
 GRAVITY = 9.81  # m/s2
 
@@ -41,12 +41,7 @@ def wrench_inputs(
     wrench: ObjectWrench, to_jax: Callable[[Tensor], Array]
 ) -> WrenchInputs:
     """The arrays of all worlds, (N, ...), but ``limits``, which they share."""
-    limits = (
-        wrench.hold_stiffness,
-        wrench.torque_ratio,
-        wrench.force_limit,
-        wrench.torque_limit,
-    )
+    limits = [getattr(wrench, name) for name in LIMITS]
     arrays = [getattr(wrench, name) for name in WrenchInputs._fields[:-1]]
     return WrenchInputs(*map(to_jax, arrays), limits=jnp.array(limits, jnp.float32))
 
@@ -54,10 +49,7 @@ def wrench_inputs(
 def object_wrench(act: WrenchInputs, pose: Array, vel: Array) -> Array:
     """Force and torque on each object of one world, world axes, (O, 6).
 
-    Args:
-        act: what acts during this control step.
-        pose: object position and quaternion, world, (O, 7).
-        vel: linear and angular velocity, world, (O, 6).
+    Poses (O, 7) and velocities (O, 6), linear before angular, are in the world.
     """
     turn = jax.vmap(_turn)(act.ref_pose[:, 3:], pose[:, 3:])
     offset = jnp.concatenate([act.ref_pose[:, :3] - pose[:, :3], turn], -1)

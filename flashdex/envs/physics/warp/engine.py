@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from flashdex import keys
-from flashdex.envs.physics.base import Engine, RawState
+from flashdex.envs.physics.base import Physics, RawState
 from flashdex.envs.physics.warp.model import (
     WorldRows,
     model_fields,
@@ -36,11 +36,7 @@ class Recorded:
 
     The first call runs as it is, which compiles the kernels; the second records it, as
     a CUDA graph or as warp's list of launches on the CPU. Where that fails the function
-    goes on as it is, with one warning.
-
-    Args:
-        launch: launches kernels; nothing else.
-        device: of the arrays.
+    goes on as it is, with one warning. ``launch`` does nothing but launch kernels.
     """
 
     def __init__(self, launch: Callable[[], None], device: torch.device) -> None:
@@ -96,7 +92,7 @@ def _kinds(overflow: Any) -> dict[str, int]:
     }
 
 
-class WarpPhysics(Engine):
+class WarpPhysics(Physics):
     """One model of mujoco_warp whose rows follow each world's motion; see ``Physics``.
 
     It computes in float32 and runs on the first CUDA device, without one on the CPU.
@@ -134,24 +130,12 @@ class WarpPhysics(Engine):
         self._forward = Recorded(self._launch_forward, self.device)
         self._rows.write(torch.ones_like(self._bad), self._motion)
 
-    def reset(
-        self,
-        mask: Tensor,
-        motion: Tensor,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        object_pose: Tensor,
-        object_vel: Tensor,
-    ) -> None:
-        """Put worlds into given states; see ``Physics.reset``."""
-        self._motion.copy_(torch.where(mask, motion, self._motion))
+    def _place(self, mask: Tensor, *state: Tensor) -> None:
         self._rows.write(mask, self._motion)
-        state = self.map.write(
-            self._motion, joint_pos, joint_vel, object_pose, object_vel
-        )
         chosen = mask.unsqueeze(-1)
         views = (self._qpos, self._qvel, self._ctrl)
-        for view, value in zip(views, state, strict=True):
+        flat = self.map.write(self._motion, *state)
+        for view, value in zip(views, flat, strict=True):
             view.copy_(torch.where(chosen, value.float(), view))
         for view in (self._warmstart, self._xfrc, self._wrench.applied):
             held = mask.reshape(-1, *[1] * (view.ndim - 1))
@@ -187,7 +171,7 @@ class WarpPhysics(Engine):
         return RawState(self._qpos, self._qvel, self._ctrl, self._wrench.applied)
 
     def take_overflow(self) -> dict[str, int]:
-        """Worlds whose room was too small since the last call; see the protocol."""
+        """Worlds whose room was too small since the last call; see ``Physics``."""
         mjw = require_warp()[1]
         found = self._overflow.clone()
         self._overflow.zero_()

@@ -31,21 +31,13 @@ _MAKERS = ("empty", "zeros", "ones", "full", "empty_like", "zeros_like", "clone"
 
 @dataclasses.dataclass(frozen=True)
 class WarpMemory:
-    """Bytes of the warp engine.
+    """Bytes of the warp engine."""
 
-    Attributes:
-        fixed: model and data that do not grow with the worlds.
-        model: each world's own rows of the model.
-        data: each world's state, contacts and constraints.
-        step: what a step allocates for each world while it runs.
-        room: contacts and constraint rows that this is for.
-    """
-
-    fixed: int
-    model: int
-    data: int
-    step: int
-    room: Room
+    fixed: int  # model and data that do not grow with the worlds
+    model: int  # each world's own rows of the model
+    data: int  # each world's state, contacts and constraints
+    step: int  # what a step allocates for each world while it runs
+    room: Room  # contacts and constraint rows that this is for
 
     @property
     def per_world(self) -> int:

@@ -128,17 +128,11 @@ def _refuse_shared(union: SceneUnion) -> None:
 
 @dataclass(frozen=True)
 class Room:
-    """Buffer sizes of one world; contacts are a pool that all worlds share.
+    """Buffer sizes of one world; contacts are a pool that all worlds share."""
 
-    Attributes:
-        contacts: contact points, and pairs that the broad phase finds.
-        convex: pairs of one kind that need the general convex collider.
-        rows: constraint rows, of which each world has its own.
-    """
-
-    contacts: int
-    convex: int
-    rows: int
+    contacts: int  # contact points, and pairs that the broad phase finds
+    convex: int  # pairs of one kind that need the general convex collider
+    rows: int  # constraint rows, of which each world has its own
 
 
 def room_of(model: mujoco.MjModel, physics: PhysicsConfig) -> Room:

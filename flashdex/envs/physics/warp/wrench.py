@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from flashdex.envs.physics.warp.model import require_warp
-from flashdex.envs.scene.wrench import ObjectWrench
+from flashdex.envs.scene.wrench import LIMITS, ObjectWrench
 
 if TYPE_CHECKING:
     import mujoco
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from flashdex.envs.physics.state_map import StateMap
 
 _TENSORS = ("ref_pose", "ref_vel", "mass", "inertia", "present", "hold", "kp", "kv")
-_PARAMS = ("hold_stiffness", "torque_ratio", "force_limit", "torque_limit")
 
 
 class WrenchInput:
@@ -40,8 +39,8 @@ class WrenchInput:
             kind = torch.bool if name == "present" else torch.float32
             shape = (num_envs, *shapes.get(name, ()))
             self._copies[name] = torch.zeros(shape, dtype=kind, device=device)
-        self._params = torch.zeros(len(_PARAMS), device=device)
-        self._values: list[float] = [0.0] * len(_PARAMS)
+        self._params = torch.zeros(len(LIMITS), device=device)
+        self._values: list[float] = [0.0] * len(LIMITS)
         self.applied = torch.zeros(num_envs, slots, 6, device=device)
         bodies = [model.body(f"object{s}").id for s in range(used)]
         places = [
@@ -69,7 +68,7 @@ class WrenchInput:
         """Take over the numbers of a control step."""
         for name, copy in self._copies.items():
             copy.copy_(getattr(wrench, name))
-        for i, name in enumerate(_PARAMS):
+        for i, name in enumerate(LIMITS):
             value = getattr(wrench, name)
             if value != self._values[i]:
                 self._params[i].fill_(value)

@@ -27,15 +27,13 @@ from flashdex.datasets.hot3d.files import (
     read_poses,
 )
 from flashdex.datasets.hot3d.hands import read_keypoints
-from flashdex.datasets.hot3d.objects import (
+from flashdex.datasets.hot3d.world import (
     INSTANCES,
+    TEST_PARTICIPANTS,
     ObjectLibrary,
     find_library,
-    read_objects,
-)
-from flashdex.datasets.hot3d.world import (
-    TEST_PARTICIPANTS,
     read_metadata,
+    read_objects,
     refuse_without_truth,
     up_axis,
 )

@@ -18,8 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.procedural.carry import CarryPlan, Track, carry_track
-from flashdex.datasets.procedural.shapes import SHAPES
+from flashdex.datasets.procedural.carry import SHAPES, CarryPlan, Track, carry_track
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import continuous, to_quat
 from flashdex.errors import UnknownSourceError

@@ -62,10 +62,6 @@ def _modules() -> dict[str, str]:
 def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     """All recordings of a source, in a fixed order; none of them is read yet.
 
-    Args:
-        source: name of a reader.
-        options: where the dataset lies, and what else the reader needs.
-
     Raises:
         UnknownSourceError: names the known readers.
         DemoError: an option is missing, or the root is not such a dataset.

@@ -18,11 +18,7 @@ FAVOURITES = ("visual", "mesh")
 
 
 def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
-    """Refuse a root that lacks the folders of a dataset.
-
-    Raises:
-        DemoError: what was sought, what was found, and what is probably meant.
-    """
+    """Refuse a root that lacks the folders of a dataset; tell what is meant."""
     missing = [folder for folder in folders if not (root / folder).is_dir()]
     if missing:
         raise DemoError(
@@ -103,11 +99,7 @@ def find_mesh(name: str, folders: Iterable[Path], *, where: Path | str) -> Path:
 
 
 def mesh_in(folder: Path) -> Path | None:
-    """The mesh in an object's own folder, or None if it has none.
-
-    Raises:
-        DemoError: several meshes, none with a name that tells which to take.
-    """
+    """The mesh in an object's own folder, or None; several need a telling name."""
     if not folder.is_dir():
         return None
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES)
@@ -133,11 +125,7 @@ def require_mesh(file: Path, hint: str) -> Path:
 
 
 def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
-    """The mesh file itself, or its mesh made larger by ``scale``.
-
-    Raises:
-        DemoError: the mesh has to be scaled and cannot be read.
-    """
+    """The mesh file itself, or its mesh made larger by ``scale``."""
     if scale == 1.0:
         return file
     try:

@@ -40,13 +40,9 @@ def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
     MCP - wrist) with operands swapped for the left hand, made orthogonal to x;
     y = z x x.
 
-    Args:
-        keypoints: m, world, (T, 21, 3); NaN where a frame was not tracked.
-        side: of the hand.
-
-    Returns:
-        Wrist position and quaternion wxyz, (T, 7), NaN in the same frames, and where
-        the points span no palm: zeros stand for a missing hand in many files.
+    Of keypoints in m, world, (T, 21, 3): wrist position and quaternion wxyz, (T, 7);
+    NaN in frames with NaN, and where the points span no palm: zeros stand for a
+    missing hand in many files.
     """
     pose = np.full((len(keypoints), 7), np.nan)
     seen = np.asarray((np.abs(keypoints) < FARTHEST).all(axis=(1, 2)))
@@ -90,10 +86,7 @@ def linear_velocity(
 ) -> np.ndarray:
     """Smoothed central differences, (x_{t+1} - x_{t-1}) fps / 2; one-sided at the ends.
 
-    Args:
-        values: track, (T, ...).
-        fps: frames a second.
-        sigma: of the Gaussian, frames; 0 for none.
+    Of a track (T, ...); ``sigma`` of the Gaussian in frames, 0 for none.
     """
     speed = np.gradient(values, 1.0 / fps, axis=0)
     return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
@@ -104,19 +97,12 @@ def angular_velocity(
 ) -> np.ndarray:
     """Rotation rate in the world, log(R_{t+1} R_{t-1}^T) fps / 2, smoothed; rad/s.
 
-    Args:
-        quats: wxyz, (T, 4).
-        fps: frames a second.
-        sigma: of the Gaussian, frames; 0 for none.
+    Of quaternions wxyz, (T, 4); ``sigma`` as in ``linear_velocity``.
     """
     after = np.minimum(np.arange(len(quats)) + 1, len(quats) - 1)
     before = np.maximum(np.arange(len(quats)) - 1, 0)
-    steps = (after - before)[:, None]
-    speed = (
-        (rotation(quats[after]) * rotation(quats[before]).inv()).as_rotvec()
-        * fps
-        / steps
-    )
+    turns = (rotation(quats[after]) * rotation(quats[before]).inv()).as_rotvec()
+    speed = turns * fps / (after - before)[:, None]
     return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
 
 
@@ -141,12 +127,7 @@ def missing_frames(*tracks: np.ndarray) -> np.ndarray:
 
 
 def short_gaps(missing: np.ndarray, fps: float) -> list[tuple[int, int]]:
-    """Runs of missing frames of at most 0.1 s (start, end excluded) inside a track.
-
-    Args:
-        missing: (T,) bool.
-        fps: frames a second.
-    """
+    """Runs of missing frames (T,) of at most 0.1 s (start, end excluded) inside it."""
     limit = max(int(GAP_SECONDS * fps + 1e-6), LEAST_GAP)
     gaps = [(a, b) for a, b in runs(missing) if b - a <= limit]
     return [(a, b) for a, b in gaps if a > 0 and b < len(missing)]
@@ -176,14 +157,7 @@ def _parts(start: int, end: int) -> np.ndarray:
 
 
 def align_signs(pose: np.ndarray) -> tuple[np.ndarray, int]:
-    """Unit quaternions without sign flips in the tracked frames.
-
-    Args:
-        pose: (T, 7), NaN where not tracked.
-
-    Returns:
-        A new track, and how many flips there were.
-    """
+    """A copy of a pose track (T, 7) without sign flips, and how many it had."""
     tracked = ~missing_frames(pose)
     if not tracked.any():
         return pose.copy(), 0

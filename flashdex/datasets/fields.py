@@ -50,6 +50,12 @@ def to_array(value: Any, size: int, *, what: str) -> np.ndarray:
     return array.reshape(size)
 
 
+def row(data: Any, sizes: Mapping[str, int], *, where: str) -> np.ndarray:
+    """Entries of a table, each with its count of numbers, one after the other."""
+    parts = [(part(data, key, where=where), key, size) for key, size in sizes.items()]
+    return np.concatenate([to_array(v, n, what=f"{where}: {k}") for v, k, n in parts])
+
+
 def words(value: Any) -> list[str]:
     """All texts of an array of any rank, or of one that stands alone."""
     if isinstance(value, np.ndarray):

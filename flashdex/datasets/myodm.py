@@ -46,14 +46,10 @@ MAX_BYTES = 1_000_000
 
 
 def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
-    """Keypoints of joint positions; no joint is clamped to its range.
+    """Keypoints, m, world, (T, 21, 3); no joint is clamped to its range.
 
-    Args:
-        tree: ``myohand_body.xml``.
-        joint_pos: six root joints, then the hand's, m and rad, (T, 29).
-
-    Returns:
-        m, world, (T, 21, 3).
+    Of the tree ``myohand_body.xml`` at joint positions (T, 29), m and rad: six of the
+    root, then the hand's.
     """
     model, owners = _model(tree)
     data = mujoco.MjData(model)

@@ -21,7 +21,7 @@ import numpy as np
 
 from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fields import numbers, part, poses_from_matrices, to_array
+from flashdex.datasets.fields import numbers, part, poses_from_matrices, row, to_array
 from flashdex.datasets.files import load_pickle, refuse_clone, refuse_pointer, told
 from flashdex.datasets.roots import relative, require_folders, scaled_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
@@ -29,6 +29,7 @@ from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
 NUM_POSE, NUM_BETAS = 48, 10
+FRAME = {"hand_pose": NUM_POSE, "hand_trans": 3}  # axis-angle, rad; wrist position, m
 FPS = 30.0
 HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
 ROLES = ("tool", "target")
@@ -132,7 +133,7 @@ def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarr
         frames = [(str(file), load_pickle(file)) for file in files]
     else:
         frames = _all_frames(files[0])
-    table = np.stack([_frame_row(frame, where=where) for where, frame in frames])
+    table = np.stack([row(frame, FRAME, where=where) for where, frame in frames])
     return load_mano(sequence.mano, side).keypoints_of(
         table[:, :3],
         table[:, 3:NUM_POSE],
@@ -160,17 +161,6 @@ def _frame_order(key: object) -> tuple[int, str]:
     """Time order of frame keys, with or without leading zeros."""
     text = str(key)
     return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
-
-
-def _frame_row(frame: Any, *, where: str) -> np.ndarray:
-    """Axis-angle, rad, then wrist position, m, (51,)."""
-    sizes = {"hand_pose": NUM_POSE, "hand_trans": 3}
-    return np.concatenate(
-        [
-            to_array(part(frame, key, where=where), size, what=f"{where}: {key}")
-            for key, size in sizes.items()
-        ]
-    )
 
 
 def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObject:

@@ -60,15 +60,10 @@ class UmeTrackHand:
     def keypoints(
         self, angles: np.ndarray, wrist: np.ndarray, side: Side
     ) -> np.ndarray:
-        """Keypoints of a motion.
+        """Keypoints in the 21-order, m, world, (T, 21, 3); NaN where an input is.
 
-        Args:
-            angles: of the hinges, rad, (T, J).
-            wrist: position (m) and quaternion wxyz in the world, (T, 7).
-            side: of the hand; the right one is the mirror image.
-
-        Returns:
-            Keypoints in the 21-order, m, world, (T, 21, 3); NaN where an input is.
+        Of angles of the hinges, rad, (T, J), and wrist position (m) and quaternion wxyz
+        in the world, (T, 7).
         """
         seen = ~missing_frames(angles, wrist)
         out = np.full((len(angles), len(self.points), 3), np.nan)

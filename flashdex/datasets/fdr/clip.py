@@ -148,14 +148,8 @@ def support_height(
     """Height of the table from ``support_disks`` (K, 5): x, y, z_top, radius, height.
 
     The table is the lowest disc over which an object's origin starts or ends. Discs
-    of radius 0 are padding. With no such disc the height is left to be estimated.
-
-    Args:
-        clip: arrays of the clip.
-        poses: of the objects, (T, 7).
-
-    Returns:
-        Height, m, or None, and how it was decided.
+    of radius 0 are padding. With no such disc the height (m) is left to be estimated.
+    Poses of the objects, (T, 7). Also told is how it was decided.
     """
     if "support_disks" not in clip:
         return None, "no support_disks in the file: estimated from objects at rest"
@@ -183,16 +177,7 @@ def context_objects(
 
     Their tracks cover the whole recording that the clip was cut from; the clip's place
     in it is where its own object has the same track. Where this is not certain, the
-    objects are left out.
-
-    Args:
-        clip: arrays of the clip.
-        held: the objects of the hands.
-        seek: mesh file by object id, or None.
-        file: for messages.
-
-    Returns:
-        The objects, and what is to be told about them.
+    objects are left out. ``seek`` gives the mesh file of an object id, or None.
     """
     if "desk_context_ids" not in clip or "desk_context_poses" not in clip:
         return [], {}

@@ -46,11 +46,7 @@ def pack_objects(file: Path) -> list[str]:
 
 
 def unpack(file: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The arrays of one clip, by the names of ``human_demo/<clip>.npz``.
-
-    Returns:
-        The clip, with ``fps``, and what is to be told about it.
-    """
+    """The arrays of one clip, by the names of ``human_demo/<clip>.npz``, and notes."""
     pack = _open(file)
     start = int(pack["length_starts"][row])
     end = start + int(pack["motion_num_frames"][row])

@@ -35,17 +35,10 @@ Hands = dict[Side, np.ndarray]
 def read_keypoints(
     folder: Path, axis: FrameAxis, mano: Path | None, *, allowed: np.ndarray
 ) -> tuple[Hands, dict[str, Any]]:
-    """Keypoints on the frames of a sequence, and what was decided.
+    """Keypoints on the frames of a sequence, and entries for the provenance.
 
-    Args:
-        folder: of the sequence.
-        axis: its frames.
-        mano: folder of the MANO models; without it UmeTrack is used.
-        allowed: frames in which hand poses are valid, (T,).
-
-    Returns:
-        Per recorded hand (T, 21, 3), m, world, NaN where it was not tracked; and
-        entries for the provenance.
+    By the MANO models of a folder; without one by UmeTrack. Per recorded hand
+    (T, 21, 3), m, world, NaN where it was not tracked or not ``allowed`` (T,).
     """
     if mano is None:
         hands, notes = _read_umetrack(folder, axis)
@@ -115,14 +108,9 @@ def _choose_left(
 ) -> tuple[ManoModel, dict[str, Any]]:
     """The left model whose wrist, J0(betas) + t, is nearer to the UmeTrack wrist.
 
-    Args:
-        mano: folder of the models.
-        rows: of the left hand, (T, 32).
-        wrist: by UmeTrack, m, (T, 3), NaN where it was not tracked; None without it.
-
-    Returns:
-        The model, and how it was chosen; as fixed where nothing can be compared, which
-        is what the dataset's own code does.
+    Rows of the left hand (T, 32), its wrist by UmeTrack, m, (T, 3), NaN where it was
+    not tracked. As fixed where nothing can be compared, which is what the dataset's own
+    code does.
     """
     fixed = load_mano(mano, "left", fix_left_shape=True)
     raw = load_mano(mano, "left", fix_left_shape=False)

@@ -148,14 +148,7 @@ def _library_files(folder: Path, library: ObjectLibrary) -> tuple[Path, ...]:
 def read_sequence(
     folder: Path, root: Path, library: ObjectLibrary, mano: Path | None
 ) -> list[HumanDemo]:
-    """One sequence, uncut, at 30 fps.
-
-    Args:
-        folder: of the sequence.
-        root: of the dataset.
-        library: of the object models.
-        mano: folder of the MANO models; None for UmeTrack keypoints.
-    """
+    """One sequence, uncut, at 30 fps; without MANO models by UmeTrack keypoints."""
     metadata = read_metadata(folder / METADATA_FILE)
     refuse_without_truth(folder, metadata, "umetrack" if mano is None else "mano")
     tracks = read_poses(folder / OBJECTS_FILE)
@@ -165,12 +158,8 @@ def read_sequence(
     objects, found = read_objects(
         folder.name, tracks, axis, objects_allowed, library, metadata.names
     )
-    up, measured = up_axis(
-        folder.name,
-        metadata.headset,
-        _headset(folder),
-        [track.values[:, :3] for track in tracks.values()],
-    )
+    places = [track.values[:, :3] for track in tracks.values()]
+    up, measured = up_axis(folder.name, metadata.headset, _headset(folder), places)
     keypoints, decided = read_keypoints(folder, axis, mano, allowed=hands_allowed)
     return [
         HumanDemo(
@@ -188,11 +177,10 @@ def read_sequence(
                 "headset": metadata.headset,
                 "participant": metadata.participant,
                 **({"version": metadata.version} if metadata.version else {}),
-                **_time_notes(axis),
-                **notes,
-                **measured,
-                **decided,
-                **found,
+                "fps": round(axis.fps, 3),
+                "stamps": axis.rule,
+                "unrecorded_frames": int((~axis.recorded).sum()),
+                **(notes | measured | decided | found),
             },
         )
     ]
@@ -211,14 +199,6 @@ def _apply_masks(
             refused[name] = int((~frames).sum())
     absent = [name for name in MASKS if masks[name] is None]
     return allowed[0], allowed[1], {"masked_frames": refused, "absent_masks": absent}
-
-
-def _time_notes(axis: FrameAxis) -> dict[str, Any]:
-    return {
-        "fps": round(axis.fps, 3),
-        "stamps": axis.rule,
-        "unrecorded_frames": int((~axis.recorded).sum()),
-    }
 
 
 def _headset(folder: Path) -> np.ndarray:

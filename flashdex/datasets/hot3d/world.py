@@ -65,13 +65,7 @@ def _truth(data: dict[str, Any]) -> dict[str, bool]:
 
 
 def refuse_without_truth(folder: Path, metadata: Metadata, hands: str) -> None:
-    """Refuse a sequence whose poses were not published.
-
-    Args:
-        folder: of the sequence.
-        metadata: of it.
-        hands: the kind of hand poses that is wanted, ``mano`` or ``umetrack``.
-    """
+    """Refuse a sequence whose poses were not published; hands: mano or umetrack."""
     kinds = {"objects": "object poses", hands: f"{hands} hand poses"}
     missing = [
         text for kind, text in kinds.items() if not metadata.truth.get(kind, True)
@@ -96,14 +90,8 @@ def up_axis(
     The headset must be above the objects. Where the other axis puts the headset higher
     and at the same time finds the objects lying much flatter, the metadata is wrong.
 
-    Args:
-        name: of the sequence, for messages.
-        headset: of the metadata.
-        head: positions of the headset, m, world, (T, 3); empty if not known.
-        objects: positions of each object, m, world, (T, 3).
-
-    Returns:
-        The axis, and what was measured.
+    Positions of the headset (empty if not known) and of each object, m, world, (T, 3).
+    Returns the axis, and what was measured.
     """
     kind = next((kind for kind in UP_OF if headset.lower().startswith(kind)), None)
     if kind is None:
@@ -200,16 +188,9 @@ def read_objects(
 ) -> tuple[list[DemoObject], dict[str, Any]]:
     """Objects with a model, on the frames of the sequence.
 
-    Args:
-        name: of the sequence, for messages.
-        tracks: poses by uid.
-        axis: frames.
-        allowed: frames in which object poses are valid, (T,).
-        library: of the models.
-        names: by uid, where ``instance.json`` has none.
-
-    Returns:
-        The objects; and for the provenance: which have no model, which moves most.
+    Tracks by uid, NaN where not ``allowed`` (T,); names by uid, where
+    ``instance.json`` has none. For the provenance: which have no model, which moves
+    most.
     """
     names = names | library.names()
     found: list[DemoObject] = []

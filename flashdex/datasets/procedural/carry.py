@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.body_models.human_hand import (
     FINGER_RADIUS,
-    OPEN,
     Grasp,
     GraspTarget,
     fit_grasp,
@@ -202,12 +201,7 @@ def _hand_path(
     """Keypoints in the object frame, (T, 21, 3)."""
     share = _largest_opening(grasp, rest)
     steps = np.linspace(0, 1, 33)
-    shapes = np.stack(
-        [
-            grasp.keypoints(grasp.angles + s * share * (OPEN - grasp.angles))
-            for s in steps
-        ]
-    )
+    shapes = np.stack([grasp.opened(step * share) for step in steps])
     place = np.clip(opening, 0, 1) * (len(steps) - 1)
     low = np.minimum(place.astype(int), len(steps) - 2)
     part = (place - low)[:, None, None]
@@ -221,8 +215,7 @@ def _hand_path(
 def _largest_opening(grasp: Grasp, rest: float) -> float:
     """Share of the open posture that keeps all fingers off the table."""
     for share in np.linspace(OPENING, 0.1, 9):
-        points = grasp.keypoints(grasp.angles + share * (OPEN - grasp.angles))
-        if points[:, 2].min() > -rest + FINGER_RADIUS:
+        if grasp.opened(share)[:, 2].min() > -rest + FINGER_RADIUS:
             return float(share)
     return 0.1
 

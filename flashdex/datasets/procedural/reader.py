@@ -78,17 +78,12 @@ QUICKSTART = (
 def procedural(
     seed: int = 0, count: int | None = None, kinds: Sequence[str] = QUICKSTART
 ) -> list[HumanDemo]:
-    """Human demonstrations of the given kinds.
+    """Human demonstrations, named by their kind; repetitions get a number.
 
     Args:
-        seed: of everything; the same seed gives the same motions, and a motion does not
-            depend on how many others are made.
-        count: how many; the kinds are gone through in order, again and again. One of
-            each by default.
+        seed: of everything; a motion does not depend on how many others are made.
+        count: the kinds are gone through again and again; by default one of each.
         kinds: names in ``KINDS``.
-
-    Returns:
-        Motions named by their kind; repetitions get a number.
     """
     listed = _list(seed, count, kinds)
     return [demo for recording in listed for demo in recording.read()]

@@ -93,13 +93,8 @@ def fill_hand(
 def find_axes(tips: np.ndarray, side: Side) -> tuple[np.ndarray, dict]:
     """The palm's axes in the wrist frame: documented, or those the tips speak for.
 
-    Args:
-        tips: in the wrist frame, m, (T, 5, 3).
-        side: of the hand.
-
-    Returns:
-        Columns are the palm's axes, (3, 3); and the distance of the tips to those of
-        a nominal hand, m.
+    Tips in the wrist frame, m, (T, 5, 3). The palm's axes are columns, (3, 3); with
+    the distance of the tips to those of a nominal hand, m.
     """
     nominal = hand_keypoints(np.stack([OPEN, GRASP])).mean(0)[list(TIP_KEYPOINTS)]
     nominal = nominal * _mirror(side)
@@ -124,14 +119,8 @@ def pose_hand(tips: np.ndarray, side: Side) -> tuple[np.ndarray, dict]:
 
     Knuckles stand at nominal places, larger only if a tip were out of reach. The bend
     of the middle joint follows from the distance of tip and knuckle; the distal joint
-    bends along. What is left is taken up by stretching, so that tips are exact.
-
-    Args:
-        tips: in the palm frame, m, (T, 5, 3).
-        side: of the hand.
-
-    Returns:
-        Keypoints in the palm frame, (T, 21, 3), and the stretch of the bones (95 %).
+    bends along. What is left is taken up by stretching, so that tips are exact. Tips
+    (T, 5, 3) and keypoints (T, 21, 3) in the palm frame, m; with the stretch (95 %).
     """
     flip = _mirror(side)
     tips = tips * flip  # from here on a right hand

@@ -5,7 +5,7 @@ They lie in ``processed/<dataset>/mano/<embodiment>/<task>/<id>/``: per side s
 ``qpos_obj_{s}`` (T, 7); positions in metres and quaternions wxyz, z up. A side that
 takes no part is zero. ``task_info.json``, there or one level up, names the meshes'
 folders and the time step ``ref_dt``; without it the rate is 50 Hz. An object that both
-hands use stands on the right only. Knuckles are not stored (see ``spider_hand``).
+hands use stands on the right only. Knuckles are not stored (see ``spider.hand``).
 """
 
 from __future__ import annotations

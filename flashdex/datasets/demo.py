@@ -15,8 +15,7 @@ from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import load_mesh
 
 MIN_SECONDS, MAX_SECONDS = 1.0, 20.0  # of a motion
-# below these a recording is refused as it is read
-LEAST_FRAMES, LEAST_SECONDS = 10, 0.5
+LEAST_FRAMES, LEAST_SECONDS = 10, 0.5  # below, a recording is refused as it is read
 QUAT_TOLERANCE = 1e-2
 # turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
 UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
@@ -84,14 +83,10 @@ class HumanDemo:
         return self.num_frames / self.fps
 
     def validate(self, *, complete: bool = True) -> None:
-        """Refuse a recording that cannot be used.
+        """Refuse a recording that cannot be used: motion, track and first frame.
 
-        Args:
-            complete: every frame must be tracked, and there must be enough of them;
-                before repair, only what repair cannot mend counts.
-
-        Raises:
-            DemoError: names the motion, the track and the first frame at fault.
+        With ``complete`` every frame must be tracked, and there must be enough of them;
+        before repair, only what repair cannot mend counts.
         """
         if not self.keypoints:
             raise DemoError(

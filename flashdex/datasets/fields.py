@@ -50,10 +50,15 @@ def to_array(value: Any, size: int, *, what: str) -> np.ndarray:
     return array.reshape(size)
 
 
-def row(data: Any, sizes: Mapping[str, int], *, where: str) -> np.ndarray:
+def row(
+    data: Any, sizes: Mapping[str, int], *, where: str, file: str = ""
+) -> np.ndarray:
     """Entries of a table, each with its count of numbers, one after the other."""
-    parts = [(part(data, key, where=where), key, size) for key, size in sizes.items()]
-    return np.concatenate([to_array(v, n, what=f"{where}: {k}") for v, k, n in parts])
+    parts = [
+        to_array(part(data, key, where=where), size, what=f"{file or where}: {key}")
+        for key, size in sizes.items()
+    ]
+    return np.concatenate(parts)
 
 
 def words(value: Any) -> list[str]:

@@ -144,7 +144,6 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
 
 
 def _read_array(data: bytes) -> Any:
-    """An array of .npy bytes."""
     file = io.BytesIO(data)
     version = "_".join(map(str, np.lib.format.read_magic(file)))
     shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(

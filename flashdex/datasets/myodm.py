@@ -125,8 +125,7 @@ def _add_inertia(body: ET.Element) -> None:
 
 
 def _owner(model: mujoco.MjModel, name: str) -> tuple[bool, int]:
-    is_site = name.startswith("site:")
-    if is_site:
+    if name.startswith("site:"):
         return True, model.site(name.removeprefix("site:")).id
     return False, model.body(name).id
 

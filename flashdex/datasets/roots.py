@@ -13,8 +13,7 @@ from flashdex.objects.meshes import load_mesh
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".7z")
 NUM_SHOWN = 8  # entries of a folder that a message shows
 SUFFIXES = (".obj", ".ply", ".stl", ".glb")
-# names that exporters give the one mesh to look at in an object's own folder
-FAVOURITES = ("visual", "mesh")
+FAVOURITES = ("visual", "mesh")  # what exporters call the one mesh to look at
 
 
 def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
@@ -65,11 +64,8 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
 
     In each folder in turn: ``<name>.{obj,ply,stl,glb}``, then ``<name>/visual.obj``,
     ``<name>/mesh.obj``, ``<name>/<name>.obj`` (or another suffix), then the only mesh
-    in ``<name>/``.
-
-    Raises:
-        DemoError: the id is a path, or its folder holds several meshes and none of the
-            names above.
+    in ``<name>/``. A ``DemoError`` where the id is a path, or several meshes stand in
+    its folder and none of these names.
     """
     if not name or name in (".", "..") or name != Path(name).name or "\\" in name:
         text = f"Object id '{name}' must be a plain name, not a path."

@@ -20,8 +20,7 @@ from flashdex.objects.meshes import clean_mesh, hull_vertices
 STILL_SPEED = 0.03  # m/s
 STILL_TURN = 0.3  # rad/s
 STILL_SECONDS = 1 / 6
-# heights closer than this are one level, m
-LEVEL_GAP = 0.05
+LEVEL_GAP = 0.05  # m; heights closer than this are one level
 
 
 def still_runs(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:

@@ -1,10 +1,12 @@
-"""Lists TACO: a tool, a target and both hands, 30 frames a second, z up.
+"""Reads TACO: a tool, a target and both hands, 30 frames a second, z up.
 
 ``Hand_Poses/(verb, tool, target)/<sequence>/`` holds ``<side>_hand.pkl`` (older: a
 folder ``<side>_hand`` of one file a frame) and ``<side>_hand_shape.pkl``;
 ``Object_Poses/(verb, tool, target)/<sequence>/`` holds ``tool_<id>.npy`` and
 ``target_<id>.npy``, (T, 4, 4), m; ``Object_Models/<id>_cm.obj`` are the meshes.
-``flashdex.datasets.taco.sequence`` reads a sequence.
+
+MANO with the flat hand; ``hand_trans`` is the wrist. Meshes are centimetres, poses
+metres. The origin lies somewhere below the table, so no height is claimed.
 """
 
 from __future__ import annotations
@@ -35,7 +37,6 @@ HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
 ROLES = ("tool", "target")
 MESH_SCALE = 0.01  # centimetres to metres
 MAX_TRIM = 2  # frames by which tracks of a sequence may differ in length
-LICENCE = "TACO, CC BY 4.0"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +99,8 @@ def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
         fps=FPS,
         keypoints=keypoints,
         objects=[DemoObject(b.name, b.mesh, b.pose[:frames]) for b in objects],
-        source="taco",
-        licence=LICENCE,
+        source=SOURCE.name,
+        licence="TACO, CC BY 4.0",
         split=sequence.split,
         task=", ".join(sequence.words),
         provenance={
@@ -114,7 +115,6 @@ def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
 
 
 def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarray:
-    """Keypoints, m, (T, 21, 3)."""
     files = sequence.hand_files(side)
     if not files:
         raise DemoError(
@@ -158,7 +158,6 @@ def _all_frames(file: Path) -> list[tuple[str, Any]]:
 
 
 def _frame_order(key: object) -> tuple[int, str]:
-    """Time order of frame keys, with or without leading zeros."""
     text = str(key)
     return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
 
@@ -260,7 +259,6 @@ def _recording(whole: TacoSequence, models: tuple[Path, ...]) -> Recording:
 
 
 def _find_meshes(root: Path, extra: Path | None) -> dict[str, Path]:
-    """File of each mesh id; a folder that the user names goes first."""
     places = [root / folder for folder in MESH_FOLDERS]
     places = places if extra is None else [extra, *places]
     found: dict[str, Path] = {}
@@ -304,7 +302,6 @@ def _unique_names(folders: list[str]) -> list[str]:
 
 
 def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
-    """Split of each sequence, from lines ``sequence,split``."""
     with told(file, "not a readable list of splits"):
         lines = file.read_text(encoding="utf-8").split()
     matches = [SPLIT_LINE.fullmatch(line) for line in lines]

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from flashdex.keys import Side
 
-# frames of the Gaussian that smooths velocities (method.md 14)
-VELOCITY_SIGMA = 2.0
+VELOCITY_SIGMA = 2.0  # frames, of the Gaussian over velocities (method.md 14)
 # m; a number beyond is no position, and its square may not be a number at all
 FARTHEST = 1e6
 
@@ -166,6 +165,12 @@ def align_signs(pose: np.ndarray) -> tuple[np.ndarray, int]:
     pose = pose.copy()
     pose[tracked, 3:] = continuous(quats)
     return pose, flips
+
+
+def same_track(one: np.ndarray, other: np.ndarray, *, atol: float = 1e-8) -> bool:
+    """Whether two tracks (T, ...) tell the same, NaN included."""
+    same_shape = one.shape == other.shape
+    return same_shape and np.allclose(one, other, atol=atol, equal_nan=True)
 
 
 def runs(mask: np.ndarray, *, least: int = 1) -> list[tuple[int, int]]:

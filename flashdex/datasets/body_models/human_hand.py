@@ -31,10 +31,8 @@ PHALANGES = np.array(
 )
 THUMB_BASE = np.array([0.026, -0.022, 0.008])
 THUMB_BONES = np.array([0.044, 0.034, 0.028])
-# a distal joint follows its middle joint, as tendons do
-DISTAL_SHARE = 0.65
-# radius of a finger around its bones, m
-FINGER_RADIUS = 0.009
+DISTAL_SHARE = 0.65  # a distal joint follows its middle joint, as tendons do
+FINGER_RADIUS = 0.009  # m, around its bones
 
 # angles: 4 x (MCP flexion, MCP abduction, PIP flexion), then thumb (opposition,
 # extension from the palm's x axis, MCP flexion, IP flexion); radians

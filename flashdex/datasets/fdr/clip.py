@@ -15,7 +15,7 @@ import numpy as np
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import number, numbers, poses_from_matrices, word, words
 from flashdex.datasets.roots import find_mesh, scaled_mesh, seek_mesh
-from flashdex.datasets.tracks import rotation
+from flashdex.datasets.tracks import rotation, same_track
 from flashdex.errors import DemoError
 from flashdex.keys import FINGERS, SIDES, Side
 
@@ -131,15 +131,10 @@ def _objects(
 
 
 def _same(body: DemoObject, name: str, pose: np.ndarray) -> bool:
-    return (
-        body.name == name
-        and body.pose.shape == pose.shape
-        and np.allclose(body.pose, pose, atol=1e-5, equal_nan=True)
-    )
+    return body.name == name and same_track(body.pose, pose, atol=1e-5)
 
 
-# tracks of one object agree when they are closer than this, m
-SAME_PLACE = 1e-3
+SAME_PLACE = 1e-3  # m; tracks of one object agree when they are closer
 
 
 def support_height(

@@ -79,7 +79,6 @@ def read_packed(file: Path, row: int, folders: tuple[Path, ...]) -> list[HumanDe
 
 
 def _find(path: Path) -> tuple[list[Path], Path | None]:
-    """The clips, or the packed collection."""
     if path.is_file():
         return ([path], None) if path.suffix == ".npz" else ([], path)
     for folder in (path / CLIP_FOLDERS[0], path, path / CLIP_FOLDERS[1]):

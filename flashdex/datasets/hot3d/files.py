@@ -175,9 +175,7 @@ MAX_SECONDS = 4 * 3600  # no session is longer: one wrong stamp would make it ye
 class FrameAxis:
     """Uniform frames at 30 fps."""
 
-    # stamp of each frame, ns, ascending, (T,); nominal where a frame was not
-    # recorded
-    times: np.ndarray
+    times: np.ndarray  # stamps, ns, ascending, (T,); nominal where not recorded
     recorded: np.ndarray  # frames that have a stamp of their own, (T,) bool
     fps: float  # the rate that was measured
     rule: str  # how doubled stamps were told apart

@@ -80,7 +80,6 @@ def list_hot3d(options: SourceOptions) -> list[Recording]:
 
 
 def _find_sequences(root: Path) -> list[Path]:
-    """Folders of sequences: the root itself, in it, or in its groups."""
     if _is_sequence(root):
         return [root]
     groups = [root, *(root / name for name in GROUPS)]
@@ -122,7 +121,6 @@ def _wrong_root(root: Path) -> str:
 
 
 def _sequence_files(folder: Path) -> tuple[Path, ...]:
-    """Files of a sequence that decide its result, those that are there."""
     names = [OBJECTS_FILE, HEADSET_FILE, METADATA_FILE]
     hands = sorted(folder.glob("*_hand_*.json*"))
     masks = [_mask_file(folder, name) for name in MASKS]
@@ -202,7 +200,6 @@ def _apply_masks(
 
 
 def _headset(folder: Path) -> np.ndarray:
-    """Positions of the headset, m, (T, 3); empty without its trajectory."""
     file = folder / HEADSET_FILE
     tracks = list(read_poses(file).values()) if file.is_file() else []
     return np.concatenate([t.values[:, :3] for t in tracks] or [np.zeros((0, 3))])

@@ -32,8 +32,7 @@ class Metadata:
     # whether poses exist, per kind: ``objects``, ``mano``, ``umetrack``; a kind
     # of which nothing is said is missing here
     truth: dict[str, bool] = field(default_factory=dict)
-    # of the objects, by uid, where they are listed
-    names: dict[str, str] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)  # of objects, by uid, if listed
     version: str = ""  # of the dataset, where it is given
 
 

@@ -215,7 +215,7 @@ def _read_hand(
     where = f"{file}: raw_mano"
     sizes = {f"{PREFIX[side]}__{name}": size for name, size in HAND_FIELDS.items()}
 
-    read = partial(row, sizes=sizes, where=where)
+    read = partial(row, sizes=sizes, where=where, file=str(file))
     rows = _rows(by_frame, ids, read, sum(sizes.values()), where)
     if np.isnan(rows).all():
         raise DemoError(f"{file}: raw_mano has none of the mocap ids.", code="E_KEYS")

@@ -1,9 +1,13 @@
-"""Lists OakInk2: both hands and several objects, 120 frames a second, y up.
+"""Reads OakInk2: both hands and several objects, 120 frames a second, y up.
 
 ``anno_preview/<token>.pkl`` holds hands and objects by mocap id,
 ``program/program_info/<token>.json`` cuts the sequence into primitives,
 ``object_repair/align_ds/<object id>/`` (or another release of the meshes) holds one
-mesh, metres. ``flashdex.datasets.oakink2.sequence`` reads a sequence.
+mesh, metres.
+
+MANO with the flat hand; ``tsl`` is the wrist. A motion is one primitive with the
+objects of both hands; without a program it is the whole sequence with all objects, to
+be cut by contact. A hand outside of its own interval is present all the same.
 """
 
 from __future__ import annotations
@@ -43,7 +47,6 @@ from flashdex.objects.meshes import hull_vertices, load_mesh
 FPS = 120.0
 SUPPORT_STRIDE = 4  # frames; 30 a second are enough to see what rests
 Y_UP = Rotation.from_euler("x", np.pi / 2)  # to z up
-LICENCE = "OakInk2, see its dataset card (version 1 is CC BY-NC-SA 4.0)"
 
 
 def read_sequence(sequence: OakInk2Sequence) -> list[HumanDemo]:
@@ -88,8 +91,8 @@ def _demo(
         fps=FPS,
         keypoints=keypoints,
         objects=[DemoObject(b.name, b.mesh, b.pose[frames]) for b in bodies],
-        source="oakink2",
-        licence=LICENCE,
+        source=SOURCE.name,
+        licence="OakInk2, see its dataset card (version 1 is CC BY-NC-SA 4.0)",
         up="y",
         support_z=support,
         needs_cutting=item is None,
@@ -226,7 +229,6 @@ def list_oakink2(options: SourceOptions) -> list[Recording]:
 
 
 def _find_mesh_folders(root: Path, extra: Path | None) -> tuple[Path, ...]:
-    """Folders with a folder for each object; one that the user names goes first."""
     places = [root / release / ALIGNED for release in MESH_FOLDERS]
     places = places if extra is None else [extra / ALIGNED, extra, *places]
     found = tuple(place for place in places if place.is_dir())

@@ -1,4 +1,7 @@
-"""One hand carries one object: grasp, approach, lift, move, turn, place, retreat."""
+"""One hand carries one object: grasp, approach, lift, move, turn, place, retreat.
+
+Every mesh has z up as it stands on the table, and its origin at the centre of its box.
+"""
 
 from __future__ import annotations
 
@@ -118,8 +121,7 @@ SHAPES: dict[str, Callable[[np.random.Generator], Shape]] = {
 
 # nominal durations, s
 APPROACH, CLOSE, CARRY, RELEASE, RETREAT = 0.55, 0.30, 1.30, 0.25, 0.40
-# how far the hand is away at the beginning and the end, m
-STANDOFF = 0.10
+STANDOFF = 0.10  # m, how far the hand is away at the beginning and the end
 # palm inclination against the grasp axis, rad: fingers point downwards or around
 PALM_TILT = {"top": np.deg2rad(38), "side": np.deg2rad(35)}
 FINGER_PITCH = 0.020
@@ -198,7 +200,6 @@ def _object_path(
 def _hand_path(
     grasp: Grasp, shape: Shape, opening: np.ndarray, away: np.ndarray, rest: float
 ) -> np.ndarray:
-    """Keypoints in the object frame, (T, 21, 3)."""
     share = _largest_opening(grasp, rest)
     steps = np.linspace(0, 1, 33)
     shapes = np.stack([grasp.opened(step * share) for step in steps])

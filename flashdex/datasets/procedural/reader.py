@@ -30,8 +30,7 @@ NOISE_RIGID = 0.0018  # m, of the whole hand
 NOISE_TURN = np.deg2rad(1.0)
 NOISE_POINT = 0.0015  # m, of each keypoint
 NOISE_SECONDS = 0.2
-# mirror plane of the left hand: all shapes are symmetric in x
-MIRROR = np.array([-1.0, 1.0, 1.0])
+MIRROR = np.array([-1.0, 1.0, 1.0])  # of the left hand: all shapes are symmetric in x
 HAND_X = 0.16  # m, how far beside the middle each hand works when both do
 
 

@@ -41,11 +41,9 @@ DOCUMENTED = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 ARCH = 8.0
 # another choice of axes must have an error smaller than this share of the documented
 CLEARLY_BETTER = 0.6
-# the bend at which a finger is measured out, rad; beyond it the chain is shrunk
-MAX_BEND = 1.9
+MAX_BEND = 1.9  # rad, to which a finger is measured out; beyond, the chain is shrunk
 NUM_BENDS = 200
-# a hand larger than this share of the nominal one is not a hand
-MAX_SIZE = 1.3
+MAX_SIZE = 1.3  # of the nominal hand; what is larger is not a hand
 THUMB_ACROSS = np.array([0.8, 0.6, 0.0])  # the thumb bends to the fingers and across
 
 

@@ -23,7 +23,7 @@ from flashdex.datasets.files import load_npz, read_json, refuse_clone
 from flashdex.datasets.roots import find_mesh, mesh_in, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.spider.hand import fill_hand
-from flashdex.datasets.tracks import FARTHEST
+from flashdex.datasets.tracks import FARTHEST, same_track
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
@@ -44,7 +44,7 @@ def read_objects(
             raise DemoError(f"{file}: qpos_obj_{side} {stored.shape}; expected (T, 7).")
         pose = pose_track(stored, f"{file}: qpos_obj_{side}")
         mesh = _mesh(file, str(folder), objects)
-        twin = any(b.mesh == mesh and _same_track(b.pose, pose) for _, b in bodies)
+        twin = any(b.mesh == mesh and same_track(b.pose, pose) for _, b in bodies)
         # arcticv2 names the right hand's mesh on both sides; a side of zeros is empty
         if not twin and np.abs(stored[:, :3]).max(initial=0.0) > 0:
             bodies.append((side, DemoObject(_tail(str(folder)), mesh, pose)))
@@ -55,10 +55,6 @@ def read_objects(
             f"found: {', '.join(map(str, info)) or 'no such file'}."
         )
     return bodies
-
-
-def _same_track(one: np.ndarray, other: np.ndarray) -> bool:
-    return one.shape == other.shape and np.allclose(one, other, equal_nan=True)
 
 
 def hand_object(
@@ -122,8 +118,7 @@ def known_files(file: Path, objects: Path | None) -> tuple[Path, ...]:
 
 FILE = "trajectory_keypoints.npz"
 FPS = 50.0  # SPIDER's reference rate, 0.02 s a frame
-# tips that never part by more than this are those of an absent hand, m
-ABSENT_SPREAD = 1e-3
+ABSENT_SPREAD = 1e-3  # m; tips that never part by more are those of an absent hand
 # Tips farther than this from a nominal hand's, rms, m, are not those of a hand at this
 # wrist; 24 recorded hands stay below 0.09.
 MAX_TIP_ERROR = 0.12
@@ -154,7 +149,7 @@ def list_spider(options: SourceOptions) -> list[Recording]:
     names = [_name(file) for file in files]
     return [
         Recording(
-            name=name if names.count(name) == 1 else _full_name(file),
+            name=name if names.count(name) == 1 else "_".join(file.parent.parts[-5:]),
             read=partial(read_spider, file, options.models),
             files=(file, *known_files(file, options.models)),
         )
@@ -236,7 +231,6 @@ def _read_hand(
 
 
 def _dataset(file: Path, info: dict[str, Any]) -> str:
-    """Name of the dataset that SPIDER processed."""
     parts = file.parent.parts
     above = parts[parts.index("processed") + 1 :] if "processed" in parts else ()
     dataset = str(info.get("dataset_name") or (above[0] if above else ""))
@@ -257,10 +251,6 @@ def _name(file: Path) -> str:
     else:
         parts = parts[-2:]
     return "_".join(parts)
-
-
-def _full_name(file: Path) -> str:
-    return "_".join(file.parent.parts[-5:])
 
 
 SOURCE = Source(

@@ -35,11 +35,7 @@ def source_names() -> list[str]:
 
 
 def get_source(name: str) -> Source:
-    """The reader of that name.
-
-    Raises:
-        UnknownSourceError: names the known readers.
-    """
+    """The reader of that name; an ``UnknownSourceError`` names the known ones."""
     modules = _modules()
     if name in REGISTERED:
         return REGISTERED[name]
@@ -49,7 +45,6 @@ def get_source(name: str) -> Source:
 
 
 def _modules() -> dict[str, str]:
-    """Module of each reader that is found here."""
     found = {}
     for folder in map(Path, __path__):
         for file in (*folder.glob("*.py"), *folder.glob("*/reader.py")):
@@ -61,10 +56,6 @@ def _modules() -> dict[str, str]:
 
 def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
     """All recordings of a source, in a fixed order; none of them is read yet.
-
-    Args:
-        source: name of a reader.
-        options: where the dataset lies, and what else the reader needs.
 
     Raises:
         UnknownSourceError: names the known readers.

@@ -34,6 +34,7 @@ SPLIT_LIST = "splits_json/protocol_p1.json"
 MILLIMETRE = 1e-3
 HINGE = np.array([0.0, 0.0, -1.0])  # through the origin of the object frame
 PARTS = ("top", "bottom")
+JOINT = {"child": 0, "parent": 1, "axis": HINGE.tolist(), "anchor": [0.0, 0.0, 0.0]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,12 +123,7 @@ def read_sequence(sequence: ArcticSequence) -> list[HumanDemo]:
                 "files": [relative(f, sequence.root) for f in sequence.files()],
                 "fps": FPS,
                 "frames": [0, frames],
-                "joint": {
-                    "child": 0,
-                    "parent": 1,
-                    "axis": HINGE.tolist(),
-                    "anchor": [0.0, 0.0, 0.0],
-                },
+                "joint": JOINT,
                 "parts": "two rigid bodies; the hinge is not kept",
             },
         )
@@ -167,7 +163,6 @@ def _read_objects(sequence: ArcticSequence) -> list[DemoObject]:
 
 
 def _read_splits(file: Path, *, given: Path | None) -> dict[str, str]:
-    """Split by sequence, from a protocol of the dataset; empty if there is none."""
     if given is None and not file.is_file():
         return {}
     fault = (

@@ -15,8 +15,7 @@ from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import load_mesh
 
 MIN_SECONDS, MAX_SECONDS = 1.0, 20.0  # of a motion
-# below these a recording is refused as it is read
-LEAST_FRAMES, LEAST_SECONDS = 10, 0.5
+LEAST_FRAMES, LEAST_SECONDS = 10, 0.5  # below, a recording is refused as it is read
 QUAT_TOLERANCE = 1e-2
 # turns a recording's up axis into +z: y-up is (x, y, z) -> (x, -z, y)
 UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
@@ -24,17 +23,11 @@ UP_ROTATION = {"z": 0.0, "y": np.pi / 2, "-y": -np.pi / 2}
 
 @dataclass
 class DemoObject:
-    """One rigid object of a demonstration.
+    """One rigid object of a demonstration."""
 
-    Args:
-        name: unique within a library together with the mesh's content.
-        mesh: a mesh file, or the mesh itself, metres, in the frame of ``pose``.
-        pose: position (m) and quaternion (wxyz) in the world, (T, 7).
-    """
-
-    name: str
-    mesh: Path | trimesh.Trimesh
-    pose: np.ndarray
+    name: str  # unique within a library together with the mesh's content
+    mesh: Path | trimesh.Trimesh  # or its file; metres, in the frame of ``pose``
+    pose: np.ndarray  # position (m) and quaternion (wxyz) in the world, (T, 7)
 
     def load_mesh(self) -> trimesh.Trimesh:
         """The mesh, read from its file if it is given as one; not cleaned."""
@@ -47,46 +40,30 @@ class DemoObject:
 class HumanDemo:
     """One recorded human motion, before any processing; numpy float64.
 
-    Args:
-        name: unique in its collection; also the file name of what is made from it.
-        fps: frames a second of every track.
-        keypoints: per recorded hand (T, 21, 3), m, world; 0 wrist, then four a finger
-            from the thumb to the pinky.
-        palm: per recorded hand (T, 7): wrist position (m) and quaternion (wxyz) of the
-            palm frame: x to the middle MCP, z out of the palm. By default it is that
-            of the keypoints.
-        objects: the objects of the scene.
-        hand_object: which object (its place in ``objects``) a hand uses; a hand that
-            is missing here is assigned by contact.
-        source: the reader's name.
-        licence: of the recording.
-        up: which axis of the recording's world points up.
-        support_z: height of the table in the recording's world, m, if known.
-        needs_cutting: a session of many actions, to be cut where contact begins and
-            ends; otherwise one action that is used whole.
-        split: of the dataset's own partition (train, test, ...), if it has one.
-        task: what is done, in the dataset's words, if it says so.
-        provenance: files, frame range, and what the reader decided; goes into the
-            library's manifest, so JSON values only.
-
     A frame in which a hand or an object was not tracked holds NaN in all its tracks.
     ``flashdex.motions.repair`` closes short gaps and cuts at long ones before a motion
     is validated.
     """
 
-    name: str
-    fps: float
+    name: str  # unique in its collection; also the name of files made from it
+    fps: float  # frames a second of every track
+    # per recorded hand (T, 21, 3), m, world; 0 wrist, then four a finger, thumb first
     keypoints: dict[Side, np.ndarray]
+    # per recorded hand (T, 7): wrist position (m) and quaternion (wxyz) of the palm
+    # frame: x to the middle MCP, z out of the palm; by default that of the keypoints
     palm: dict[Side, np.ndarray] = field(default_factory=dict)
     objects: list[DemoObject] = field(default_factory=list)
+    # place in ``objects`` of what a hand uses; a hand missing here: by contact
     hand_object: dict[Side, int] = field(default_factory=dict)
-    source: str = ""
-    licence: str = ""
-    up: Literal["z", "y", "-y"] = "z"
-    support_z: float | None = None
+    source: str = ""  # the reader's name
+    licence: str = ""  # of the recording
+    up: Literal["z", "y", "-y"] = "z"  # axis of the recording's world
+    support_z: float | None = None  # height of the table in it, m, if known
+    # a session of many actions, to be cut where contact begins and ends
     needs_cutting: bool = False
-    split: str = ""
-    task: str = ""
+    split: str = ""  # of the dataset's own partition (train, test, ...)
+    task: str = ""  # in the dataset's words
+    # files, frame range, and what the reader decided; JSON values, for the manifest
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,14 +83,10 @@ class HumanDemo:
         return self.num_frames / self.fps
 
     def validate(self, *, complete: bool = True) -> None:
-        """Refuse a recording that cannot be used.
+        """Refuse a recording that cannot be used: motion, track and first frame.
 
-        Args:
-            complete: every frame must be tracked, and there must be enough of them;
-                before repair, only what repair cannot mend counts.
-
-        Raises:
-            DemoError: names the motion, the track and the first frame at fault.
+        With ``complete`` every frame must be tracked, and there must be enough of them;
+        before repair, only what repair cannot mend counts.
         """
         if not self.keypoints:
             raise DemoError(
@@ -196,13 +169,7 @@ class HumanDemo:
             )
 
     def cut(self, start: int, end: int, *, name: str) -> HumanDemo:
-        """The frames ``start`` (included) to ``end`` (excluded) as a motion of its own.
-
-        Args:
-            start: first frame.
-            end: one past the last frame.
-            name: of the piece.
-        """
+        """The frames ``start`` (included) to ``end`` (excluded) as a motion."""
         first = self.provenance.get("frames", [0])[0]
         return replace(
             self,

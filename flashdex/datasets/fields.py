@@ -16,14 +16,10 @@ LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def numbers(value: Any, *, what: str) -> np.ndarray:
-    """Real numbers of any shape, float64.
+    """Real numbers of any shape, float64, of an array, a tensor, a list, ...
 
-    Args:
-        value: an array, a tensor, a list, or anything else.
-        what: file and key, for the message.
-
-    Raises:
-        DemoError: it holds something else, or rows of different lengths.
+    A ``DemoError`` that names ``what`` (file and key) for anything else, and for rows
+    of different lengths.
     """
     try:
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
@@ -52,6 +48,17 @@ def to_array(value: Any, size: int, *, what: str) -> np.ndarray:
         text = f"{what}: shape {array.shape}; expected {size} numbers."
         raise DemoError(text, code="E_KEYS")
     return array.reshape(size)
+
+
+def row(
+    data: Any, sizes: Mapping[str, int], *, where: str, file: str = ""
+) -> np.ndarray:
+    """Entries of a table, each with its count of numbers, one after the other."""
+    parts = [
+        to_array(part(data, key, where=where), size, what=f"{file or where}: {key}")
+        for key, size in sizes.items()
+    ]
+    return np.concatenate(parts)
 
 
 def words(value: Any) -> list[str]:
@@ -86,17 +93,7 @@ def part(data: Any, key: str, *, where: str) -> Any:
 
 
 def track(data: Any, key: str, *shape: int, where: str) -> np.ndarray:
-    """One track of a table, (T, *shape) float64, T at least 1.
-
-    Args:
-        data: the table: a mapping of names to arrays.
-        key: of the track.
-        shape: of one frame.
-        where: file and part of it, for messages.
-
-    Raises:
-        DemoError: the key is missing or its shape is another one.
-    """
+    """One track of a table, (T, *shape) float64, T at least 1; else a ``DemoError``."""
     values = numbers(part(data, key, where=where), what=f"{where}: {key}")
     if not len(np.atleast_1d(values)) or values.shape[1:] != shape or not values.ndim:
         told = ", ".join(["T", *map(str, shape)])
@@ -106,11 +103,7 @@ def track(data: Any, key: str, *shape: int, where: str) -> np.ndarray:
 
 
 def same_length(lengths: Mapping[str, int], *, where: str) -> int:
-    """The number of frames that all tracks have.
-
-    Raises:
-        DemoError: they differ.
-    """
+    """The number of frames that all tracks have; a ``DemoError`` where they differ."""
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{name} {count}" for name, count in lengths.items())
         text = f"{where}: frames differ: {told}. Get the file anew."
@@ -119,12 +112,10 @@ def same_length(lengths: Mapping[str, int], *, where: str) -> int:
 
 
 def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Position and quaternion wxyz without sign flips, NaN in unseen frames, (T, 7).
+    """Position and quaternion wxyz without sign flips, (T, 7).
 
-    Args:
-        turns: rotations of the seen frames.
-        positions: m, (T, 3).
-        seen: frames that were tracked, (T,).
+    ``turns`` are those of the ``seen`` frames (T,), ``positions`` (m, (T, 3)) of all;
+    the others become NaN.
     """
     pose = np.full((len(positions), 7), np.nan)
     if seen.any():
@@ -136,11 +127,7 @@ def pose_track(turns: Rotation, positions: np.ndarray, seen: np.ndarray) -> np.n
 def poses_from_matrices(
     matrices: np.ndarray, *, what: str
 ) -> tuple[np.ndarray, list[str]]:
-    """Rigid transforms as positions and quaternions.
-
-    Args:
-        matrices: T_world_object, m, (T, 4, 4); NaN where a frame was not tracked.
-        what: file or object, for messages.
+    """Rigid transforms T_world_object, m, (T, 4, 4), as positions and quaternions.
 
     Returns:
         Position (m) and quaternion wxyz without sign flips, (T, 7), NaN where a matrix

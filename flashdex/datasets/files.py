@@ -29,12 +29,9 @@ BROKEN = (
 
 
 def refuse_pointer(file: Path) -> None:
-    """Refuse a Git-LFS pointer, which stands where the file should be.
+    """Refuse a Git-LFS pointer that stands where the file should be, or no file.
 
-    Raises:
-        DemoError: the file is a pointer, or no file at all but a folder, a pipe, a
-            device or a broken link.
-        FileNotFoundError: there is nothing.
+    ``FileNotFoundError`` where there is nothing at all.
     """
     if not file.is_file() and (file.exists() or file.is_symlink()):
         raise DemoError(
@@ -68,10 +65,7 @@ def refuse_clone(files: Iterable[Path]) -> None:
 def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[None]:
     """Turns what content of another layout raises into one message.
 
-    Args:
-        where: file, and place in it.
-        fault: what it is not, and what to do.
-        code: of the error.
+    ``fault`` says what it is not, and what to do.
     """
     try:
         yield
@@ -91,11 +85,7 @@ def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
 
 
 def load_pickle(path: Path) -> Any:
-    """The content of a pickle, see ``unpickle``.
-
-    Raises:
-        DemoError: the file is missing, damaged, or asks for what is not data.
-    """
+    """The content of a pickle, see ``unpickle``; a ``DemoError`` if it is not data."""
     return _open(path, "pickle", lambda file: unpickle(io.BytesIO(file.read())))
 
 
@@ -109,10 +99,8 @@ def load_npz(
 ) -> dict[str, Any]:
     """Entries of a ``.npz`` file, each as ``load_npy`` gives it.
 
-    Args:
-        path: the file.
-        only: names of the entries that are wanted, as far as they are there.
-        plain: refuse entries that hold objects.
+    ``only`` names those that are wanted, as far as they are there; ``plain`` refuses
+    entries that hold objects.
     """
     kind = ".npz without pickles" if plain else ".npz archive"
     entries = _open(path, kind, partial(_read_npz, only=only))
@@ -156,7 +144,6 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
 
 
 def _read_array(data: bytes) -> Any:
-    """An array of .npy bytes."""
     file = io.BytesIO(data)
     version = "_".join(map(str, np.lib.format.read_magic(file)))
     shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(

@@ -127,7 +127,6 @@ def _mesh_files(file: Path) -> tuple[Path, ...]:
 
 
 def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
-    """Pieces (start, end) of each recording, from all ``segments*.json``."""
     pieces: dict[str, list[tuple[int, int]]] = {}
     for file in sorted(folder.glob("segments*.json")):
         fault = "not a list of {clip, start, end}"

@@ -13,16 +13,11 @@ from flashdex.objects.meshes import load_mesh
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".7z")
 NUM_SHOWN = 8  # entries of a folder that a message shows
 SUFFIXES = (".obj", ".ply", ".stl", ".glb")
-# names that exporters give the one mesh to look at in an object's own folder
-FAVOURITES = ("visual", "mesh")
+FAVOURITES = ("visual", "mesh")  # what exporters call the one mesh to look at
 
 
 def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None:
-    """Refuse a root that lacks the folders of a dataset.
-
-    Raises:
-        DemoError: what was sought, what was found, and what is probably meant.
-    """
+    """Refuse a root that lacks the folders of a dataset; tell what is meant."""
     missing = [folder for folder in folders if not (root / folder).is_dir()]
     if missing:
         raise DemoError(
@@ -69,11 +64,8 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
 
     In each folder in turn: ``<name>.{obj,ply,stl,glb}``, then ``<name>/visual.obj``,
     ``<name>/mesh.obj``, ``<name>/<name>.obj`` (or another suffix), then the only mesh
-    in ``<name>/``.
-
-    Raises:
-        DemoError: the id is a path, or its folder holds several meshes and none of the
-            names above.
+    in ``<name>/``. A ``DemoError`` where the id is a path, or several meshes stand in
+    its folder and none of these names.
     """
     if not name or name in (".", "..") or name != Path(name).name or "\\" in name:
         text = f"Object id '{name}' must be a plain name, not a path."
@@ -103,11 +95,7 @@ def find_mesh(name: str, folders: Iterable[Path], *, where: Path | str) -> Path:
 
 
 def mesh_in(folder: Path) -> Path | None:
-    """The mesh in an object's own folder, or None if it has none.
-
-    Raises:
-        DemoError: several meshes, none with a name that tells which to take.
-    """
+    """The mesh in an object's own folder, or None; several need a telling name."""
     if not folder.is_dir():
         return None
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES)
@@ -133,11 +121,7 @@ def require_mesh(file: Path, hint: str) -> Path:
 
 
 def scaled_mesh(file: Path, scale: float) -> Path | trimesh.Trimesh:
-    """The mesh file itself, or its mesh made larger by ``scale``.
-
-    Raises:
-        DemoError: the mesh has to be scaled and cannot be read.
-    """
+    """The mesh file itself, or its mesh made larger by ``scale``."""
     if scale == 1.0:
         return file
     try:

@@ -13,23 +13,14 @@ if TYPE_CHECKING:  # names of sources are asked for where nothing is read
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """What a user tells a source; every source uses what applies to it.
+    """What a user tells a source; every source uses what applies to it."""
 
-    Attributes:
-        path: folder or file of the dataset.
-        mano: folder with ``MANO_LEFT``/``MANO_RIGHT`` (.pkl or .npz).
-        models: folder of the object models, where it lies apart from the dataset.
-        splits: file that names the split of each recording, where it lies apart.
-        seed: for sources that make motions up.
-        limit: at most this many recordings; a made-up source makes exactly this many.
-    """
-
-    path: Path | None = None
-    mano: Path | None = None
-    models: Path | None = None
-    splits: Path | None = None
-    seed: int = 0
-    limit: int | None = None
+    path: Path | None = None  # folder or file of the dataset
+    mano: Path | None = None  # with ``MANO_LEFT``/``MANO_RIGHT`` (.pkl or .npz)
+    models: Path | None = None  # folder of the object models, where it lies apart
+    splits: Path | None = None  # file of the split of each recording, if apart
+    seed: int = 0  # for sources that make motions up
+    limit: int | None = None  # of recordings; a made-up source makes exactly so many
 
     def folder(self, name: str) -> Path:
         """An option that the source needs (``Source.needs``), as it was given."""
@@ -44,37 +35,22 @@ class Recording:
 
     Listing is cheap and refuses a wrong root at once; ``read`` is called in a worker
     and may refuse the recording with a ``DemoError``.
-
-    Attributes:
-        name: unique in the source; a file name.
-        read: reads the recording as one or more motions; picklable (a
-            ``functools.partial`` of a module's function).
-        files: all files the result depends on: their content keys the cache.
-        key: whatever else it depends on, as text.
     """
 
-    name: str
+    name: str  # unique in the source; a file name
+    # one or more motions; picklable (a ``functools.partial`` of a module's function)
     read: Callable[[], list[HumanDemo]]
-    files: tuple[Path, ...] = ()
-    key: str = ""
+    files: tuple[Path, ...] = ()  # that it depends on: their content keys the cache
+    key: str = ""  # whatever else it depends on, as text
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A reader of one dataset layout.
+    """A reader of one dataset layout."""
 
-    Attributes:
-        name: how recipes and the command line call it.
-        list: names the recordings of a root, in a fixed order.
-        about: one line: what it reads.
-        licence: one line: terms of the recordings, shown before they are used.
-        needs: which options must be given (``path``, ``mano``, ...).
-        made_up: its path is a word, not a place on the disk.
-    """
-
-    name: str
-    list: Callable[[SourceOptions], list[Recording]]
-    about: str
-    licence: str = ""
-    needs: tuple[str, ...] = ("path",)
-    made_up: bool = False
+    name: str  # how recipes and the command line call it
+    list: Callable[[SourceOptions], list[Recording]]  # of a root, in a fixed order
+    about: str  # one line: what it reads
+    licence: str = ""  # one line: terms of the recordings, shown before they are used
+    needs: tuple[str, ...] = ("path",)  # options that must be given
+    made_up: bool = False  # its path is a word, not a place on the disk

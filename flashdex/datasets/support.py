@@ -20,8 +20,7 @@ from flashdex.objects.meshes import clean_mesh, hull_vertices
 STILL_SPEED = 0.03  # m/s
 STILL_TURN = 0.3  # rad/s
 STILL_SECONDS = 1 / 6
-# heights closer than this are one level, m
-LEVEL_GAP = 0.05
+LEVEL_GAP = 0.05  # m; heights closer than this are one level
 
 
 def still_runs(pose: np.ndarray, fps: float) -> list[tuple[int, int]]:
@@ -49,13 +48,8 @@ def estimate_support(
     The lowest level that holds a still run at the start or the end of the motion;
     without one, the lowest still run; without any, the lowest vertex of all frames.
 
-    Args:
-        poses: per object (T, 7).
-        vertices: per object (V, 3), m, object frame.
-        fps: frames a second.
-
-    Returns:
-        Height, m, and whether anything was at rest there.
+    Of pose tracks (T, 7) and vertices (V, 3), m, object frame, per object: the height,
+    m, and whether anything was at rest there.
     """
     at_ends, inside = [], []
     lows = [lowest_points(p, v) for p, v in zip(poses, vertices, strict=True)]
@@ -73,17 +67,10 @@ def estimate_support(
 def demo_support(
     demo: HumanDemo, meshes: list[trimesh.Trimesh] | None = None
 ) -> float | None:
-    """Height of the table that a recording's objects rest on; None if none rests.
+    """Height, m, along its up axis, of the table that a recording's objects rest on.
 
-    Args:
-        demo: with NaN where an object was not tracked.
-        meshes: of its objects, cleaned, m; read by default.
-
-    Returns:
-        m, along the recording's up axis.
-
-    Raises:
-        MeshError: a mesh cannot be used.
+    None if none rests. The objects' ``meshes``, cleaned, m, are read by default; a
+    ``MeshError`` if one cannot be used.
     """
     if meshes is None:
         meshes = [clean_mesh(b.load_mesh(), name=b.name) for b in demo.objects]

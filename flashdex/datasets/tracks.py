@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from flashdex.keys import Side
 
-# frames of the Gaussian that smooths velocities (method.md 14)
-VELOCITY_SIGMA = 2.0
+VELOCITY_SIGMA = 2.0  # frames, of the Gaussian over velocities (method.md 14)
 # m; a number beyond is no position, and its square may not be a number at all
 FARTHEST = 1e6
 
@@ -40,13 +39,9 @@ def palm_frame(keypoints: np.ndarray, side: Side) -> np.ndarray:
     MCP - wrist) with operands swapped for the left hand, made orthogonal to x;
     y = z x x.
 
-    Args:
-        keypoints: m, world, (T, 21, 3); NaN where a frame was not tracked.
-        side: of the hand.
-
-    Returns:
-        Wrist position and quaternion wxyz, (T, 7), NaN in the same frames, and where
-        the points span no palm: zeros stand for a missing hand in many files.
+    Of keypoints in m, world, (T, 21, 3): wrist position and quaternion wxyz, (T, 7);
+    NaN in frames with NaN, and where the points span no palm: zeros stand for a
+    missing hand in many files.
     """
     pose = np.full((len(keypoints), 7), np.nan)
     seen = np.asarray((np.abs(keypoints) < FARTHEST).all(axis=(1, 2)))
@@ -90,10 +85,7 @@ def linear_velocity(
 ) -> np.ndarray:
     """Smoothed central differences, (x_{t+1} - x_{t-1}) fps / 2; one-sided at the ends.
 
-    Args:
-        values: track, (T, ...).
-        fps: frames a second.
-        sigma: of the Gaussian, frames; 0 for none.
+    Of a track (T, ...); ``sigma`` of the Gaussian in frames, 0 for none.
     """
     speed = np.gradient(values, 1.0 / fps, axis=0)
     return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
@@ -104,19 +96,12 @@ def angular_velocity(
 ) -> np.ndarray:
     """Rotation rate in the world, log(R_{t+1} R_{t-1}^T) fps / 2, smoothed; rad/s.
 
-    Args:
-        quats: wxyz, (T, 4).
-        fps: frames a second.
-        sigma: of the Gaussian, frames; 0 for none.
+    Of quaternions wxyz, (T, 4); ``sigma`` as in ``linear_velocity``.
     """
     after = np.minimum(np.arange(len(quats)) + 1, len(quats) - 1)
     before = np.maximum(np.arange(len(quats)) - 1, 0)
-    steps = (after - before)[:, None]
-    speed = (
-        (rotation(quats[after]) * rotation(quats[before]).inv()).as_rotvec()
-        * fps
-        / steps
-    )
+    turns = (rotation(quats[after]) * rotation(quats[before]).inv()).as_rotvec()
+    speed = turns * fps / (after - before)[:, None]
     return gaussian_filter1d(speed, sigma, axis=0, mode="nearest") if sigma else speed
 
 
@@ -141,12 +126,7 @@ def missing_frames(*tracks: np.ndarray) -> np.ndarray:
 
 
 def short_gaps(missing: np.ndarray, fps: float) -> list[tuple[int, int]]:
-    """Runs of missing frames of at most 0.1 s (start, end excluded) inside a track.
-
-    Args:
-        missing: (T,) bool.
-        fps: frames a second.
-    """
+    """Runs of missing frames (T,) of at most 0.1 s (start, end excluded) inside it."""
     limit = max(int(GAP_SECONDS * fps + 1e-6), LEAST_GAP)
     gaps = [(a, b) for a, b in runs(missing) if b - a <= limit]
     return [(a, b) for a, b in gaps if a > 0 and b < len(missing)]
@@ -176,14 +156,7 @@ def _parts(start: int, end: int) -> np.ndarray:
 
 
 def align_signs(pose: np.ndarray) -> tuple[np.ndarray, int]:
-    """Unit quaternions without sign flips in the tracked frames.
-
-    Args:
-        pose: (T, 7), NaN where not tracked.
-
-    Returns:
-        A new track, and how many flips there were.
-    """
+    """A copy of a pose track (T, 7) without sign flips, and how many it had."""
     tracked = ~missing_frames(pose)
     if not tracked.any():
         return pose.copy(), 0
@@ -192,6 +165,12 @@ def align_signs(pose: np.ndarray) -> tuple[np.ndarray, int]:
     pose = pose.copy()
     pose[tracked, 3:] = continuous(quats)
     return pose, flips
+
+
+def same_track(one: np.ndarray, other: np.ndarray, *, atol: float = 1e-8) -> bool:
+    """Whether two tracks (T, ...) tell the same, NaN included."""
+    same_shape = one.shape == other.shape
+    return same_shape and np.allclose(one, other, atol=atol, equal_nan=True)
 
 
 def runs(mask: np.ndarray, *, least: int = 1) -> list[tuple[int, int]]:

@@ -25,7 +25,7 @@ from flashdex.datasets.keypoints import SOURCE as KEYPOINTS
 from flashdex.datasets.oakink2.reader import SOURCE as OAKINK2
 from flashdex.datasets.source import Source, SourceOptions
 from flashdex.datasets.spider.reader import SOURCE as SPIDER
-from flashdex.datasets.taco.reader import SOURCE as TACO
+from flashdex.datasets.taco import SOURCE as TACO
 from flashdex.datasets.tracks import palm_frame
 
 SECONDS = 2.0

@@ -17,7 +17,7 @@ from flashdex.datasets.fetch import fetch
 from flashdex.datasets.hot3d.files import Track, frame_axis
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, SourceOptions
-from flashdex.datasets.spider.scene import known_files, read_objects
+from flashdex.datasets.spider.reader import known_files, read_objects
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError, LibraryError, MeshError
 from flashdex.motions.library_writer import LibraryWriter, _unique_names

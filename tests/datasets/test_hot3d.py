@@ -12,8 +12,8 @@ from layouts.umetrack import UMETRACK_SHIFT, umetrack_keypoints
 from scipy.spatial.transform import Rotation
 from trimesh.proximity import closest_point
 
-from flashdex.datasets.body_models.umetrack import load_umetrack
 from flashdex.datasets.hot3d.files import Mask, Track, frame_axis
+from flashdex.datasets.hot3d.hands import load_umetrack
 from flashdex.datasets.hot3d.reader import list_hot3d
 from flashdex.datasets.source import SourceOptions
 from flashdex.objects.meshes import load_mesh

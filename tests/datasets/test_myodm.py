@@ -8,9 +8,8 @@ import pytest
 from layouts.myodm import BONE, FRAMES, PALM, write_wheel
 
 from flashdex.datasets import fetch as fetching
-from flashdex.datasets.body_models.myohand import myohand_keypoints
 from flashdex.datasets.fetch import UnknownDatasetError, fetch, myodm_dir
-from flashdex.datasets.myodm import list_myodm, read_clip
+from flashdex.datasets.myodm import list_myodm, myohand_keypoints, read_clip
 from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
 

@@ -11,7 +11,7 @@ from layouts.mano_files import write_mano
 from layouts.scene import make_scene
 
 from flashdex.datasets.source import SourceOptions
-from flashdex.datasets.taco.reader import SOURCE as TACO
+from flashdex.datasets.taco import SOURCE as TACO
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES

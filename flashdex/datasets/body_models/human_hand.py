@@ -31,10 +31,8 @@ PHALANGES = np.array(
 )
 THUMB_BASE = np.array([0.026, -0.022, 0.008])
 THUMB_BONES = np.array([0.044, 0.034, 0.028])
-# a distal joint follows its middle joint, as tendons do
-DISTAL_SHARE = 0.65
-# radius of a finger around its bones, m
-FINGER_RADIUS = 0.009
+DISTAL_SHARE = 0.65  # a distal joint follows its middle joint, as tendons do
+FINGER_RADIUS = 0.009  # m, around its bones
 
 # angles: 4 x (MCP flexion, MCP abduction, PIP flexion), then thumb (opposition,
 # extension from the palm's x axis, MCP flexion, IP flexion); radians
@@ -45,13 +43,9 @@ UPPER = np.array([1.5, 0.25, 1.7] * 4 + [1.9, 1.5, 0.9, 1.1])
 
 
 def hand_keypoints(angles: np.ndarray) -> np.ndarray:
-    """Keypoints of the right hand in its palm frame.
+    """Keypoints of the right hand in its palm frame, m, (..., 21, 3).
 
-    Args:
-        angles: rad, (..., 16).
-
-    Returns:
-        m, (..., 21, 3); keypoint 0 is the origin.
+    Of angles in rad, (..., 16); keypoint 0 is the origin.
     """
     points = np.zeros((*angles.shape[:-1], 21, 3))
     points[..., 1:5, :] = _thumb(angles[..., 12:])
@@ -111,18 +105,14 @@ class Grasp:
     angles: np.ndarray
     tip_error: float
 
-    def keypoints(self, angles: np.ndarray | None = None) -> np.ndarray:
-        """Keypoints in the object frame, m, (21, 3)."""
-        local = hand_keypoints(self.angles if angles is None else angles)
+    def opened(self, share: float) -> np.ndarray:
+        """Keypoints in the object frame, m, (21, 3); share 1 is the open hand."""
+        local = hand_keypoints(self.angles + share * (OPEN - self.angles))
         return self.palm.apply(local) + self.wrist
 
 
 def fit_grasp(target: GraspTarget) -> Grasp:
-    """Least-squares posture whose tips meet their targets, clear of object and table.
-
-    Args:
-        target: tips, palm and obstacles, object frame.
-    """
+    """Least-squares posture whose tips meet their targets, clear of obstacles."""
     nominal = Rotation.from_matrix(target.palm)
     free = np.isnan(target.tips[:, 0])
     reach = hand_keypoints(GRASP)[[4, 8, 12, 16, 20]]

@@ -120,7 +120,6 @@ def read_mano(file: Path, side: Side) -> ManoArrays:
 
 
 def _array(file: Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """One part as a dense float64 array of the expected shape."""
     found = tuple(getattr(value, "shape", ()))
     if found != shape:
         raise _wrong(
@@ -149,8 +148,7 @@ class ManoModel:
 
     side: Side  # of the hand
     arrays: ManoArrays  # of its file
-    # whether the sign error of the left shape was corrected
-    left_shape_fixed: bool = False
+    left_shape_fixed: bool = False  # whether its sign error was corrected
 
     def keypoints(
         self,

@@ -6,16 +6,16 @@ its CMC, MCP and IP, the other fingers' are MCP, PIP and DIP.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fdr.scene import context_objects, support_height
-from flashdex.datasets.fields import number, numbers, poses_from_matrices, word
+from flashdex.datasets.fields import number, numbers, poses_from_matrices, word, words
 from flashdex.datasets.roots import find_mesh, scaled_mesh, seek_mesh
-from flashdex.datasets.tracks import rotation
+from flashdex.datasets.tracks import rotation, same_track
 from flashdex.errors import DemoError
 from flashdex.keys import FINGERS, SIDES, Side
 
@@ -131,8 +131,91 @@ def _objects(
 
 
 def _same(body: DemoObject, name: str, pose: np.ndarray) -> bool:
-    return (
-        body.name == name
-        and body.pose.shape == pose.shape
-        and np.allclose(body.pose, pose, atol=1e-5, equal_nan=True)
-    )
+    return body.name == name and same_track(body.pose, pose, atol=1e-5)
+
+
+SAME_PLACE = 1e-3  # m; tracks of one object agree when they are closer
+
+
+def support_height(
+    clip: dict[str, Any], poses: list[np.ndarray]
+) -> tuple[float | None, str]:
+    """Height of the table from ``support_disks`` (K, 5): x, y, z_top, radius, height.
+
+    The table is the lowest disc over which an object's origin starts or ends. Discs
+    of radius 0 are padding. With no such disc the height (m) is left to be estimated.
+    Poses of the objects, (T, 7). Also told is how it was decided.
+    """
+    if "support_disks" not in clip:
+        return None, "no support_disks in the file: estimated from objects at rest"
+    disks = numbers(clip["support_disks"], what="support_disks")
+    if disks.size % 5:
+        raise DemoError(f"support_disks has shape {disks.shape}; expected (K, 5).")
+    disks = disks.reshape(-1, 5)
+    tops = []
+    for x, y, top, radius, _ in disks[np.isfinite(disks).all(-1) & (disks[:, 3] > 0)]:
+        ends = np.concatenate([pose[[0, -1], :2] for pose in poses])
+        if (np.hypot(*(ends - [x, y]).T) <= radius).any():
+            tops.append(float(top))
+    if not tops:
+        return None, "no object starts or ends over a disc: estimated from rest"
+    return min(tops), "lowest of support_disks over which an object starts or ends"
+
+
+def context_objects(
+    clip: dict[str, Any],
+    held: list[DemoObject],
+    seek: Callable[[str], Path | None],
+    file: Path,
+) -> tuple[list[DemoObject], dict[str, Any]]:
+    """Objects of ``desk_context_*`` that no hand holds and whose mesh is found.
+
+    Their tracks cover the whole recording that the clip was cut from; the clip's place
+    in it is where its own object has the same track. Where this is not certain, the
+    objects are left out. ``seek`` gives the mesh file of an object id, or None.
+    """
+    if "desk_context_ids" not in clip or "desk_context_poses" not in clip:
+        return [], {}
+    names = words(clip["desk_context_ids"])
+    tracks = numbers(clip["desk_context_poses"], what=f"{file}: desk_context_poses")
+    if len(tracks) != len(names):
+        raise DemoError(
+            f"{file}: desk_context_poses has {len(tracks)} tracks for {len(names)} ids."
+        )
+    scales = clip.get("desk_context_scales", np.ones(len(names)))
+    scales = numbers(scales, what=f"{file}: desk_context_scales").ravel()
+    if len(scales) != len(names):
+        raise DemoError(f"{file}: {len(scales)} scales for {len(names)} context ids.")
+    start = _place(dict(zip(names, tracks, strict=True)), held)
+    others = [i for i, name in enumerate(names) if name not in {b.name for b in held}]
+    if start is None:
+        left_out = [names[i] for i in others]
+        return [], {"desk_context": {"left_out": left_out, "why": "clip not located"}}
+    bodies, left_out = [], []
+    for i in others:
+        mesh = seek(names[i])
+        if mesh is None:
+            left_out.append(names[i])
+            continue
+        part = tracks[i][start : start + len(held[0].pose)]
+        pose, _ = poses_from_matrices(part, what=f"{file}: desk context {names[i]}")
+        bodies.append(DemoObject(names[i], scaled_mesh(mesh, float(scales[i])), pose))
+    told = {"first_frame": start, "no_mesh": left_out}
+    return bodies, {"desk_context": told}
+
+
+def _place(tracks: dict[str, np.ndarray], held: list[DemoObject]) -> int | None:
+    """First frame of the clip in the recording; None where it is not certain."""
+    frames = len(held[0].pose)
+    lengths = {len(track) for track in tracks.values()}
+    if lengths == {frames}:
+        return 0
+    known = [(tracks[b.name], b.pose) for b in held if b.name in tracks]
+    if not known or min(lengths) < frames:
+        return None
+    places = []
+    for start in range(min(lengths) - frames + 1):
+        gaps = [t[start : start + frames, :3, 3] - p[:, :3] for t, p in known]
+        if all(np.abs(gap).max() < SAME_PLACE for gap in gaps):
+            places.append(start)
+    return places[0] if len(places) == 1 else None

@@ -24,8 +24,7 @@ from flashdex.keys import SIDES
 NAME = "motion.pt"
 # The file has no rate; FDR resamples all that it imports to this one (method.md 14).
 FPS = 60.0
-# A rate that the velocities confirm within this share needs no other.
-FPS_TOLERANCE = 0.05
+FPS_TOLERANCE = 0.05  # a rate that velocities confirm within it needs no other
 MIN_SPEED = 0.01  # m/s; slower wrists say nothing about the rate
 TRACKS = ("mano_{}_joints", "mano_{}_wrist_pos", "mano_{}_wrist_rot")
 REQUIRED = ("motion_num_frames", "length_starts", "motion_filename")
@@ -46,11 +45,7 @@ def pack_objects(file: Path) -> list[str]:
 
 
 def unpack(file: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The arrays of one clip, by the names of ``human_demo/<clip>.npz``.
-
-    Returns:
-        The clip, with ``fps``, and what is to be told about it.
-    """
+    """The arrays of one clip, by the names of ``human_demo/<clip>.npz``, and notes."""
     pack = _open(file)
     start = int(pack["length_starts"][row])
     end = start + int(pack["motion_num_frames"][row])
@@ -86,11 +81,9 @@ def _object(
         )
     # two names of the same list are in use
     scales = pack.get(f"{side}_object_mesh_scales", pack.get(f"{side}_object_scales"))
-    scale = (
-        1.0
-        if scales is None or not len(scales)
-        else number(scales[slot], what=f"{file}: scale of {dirs[slot]}")
-    )
+    scale = 1.0
+    if scales is not None and len(scales):
+        scale = number(scales[slot], what=f"{file}: scale of {dirs[slot]}")
     return {
         f"obj_{side}_pose": pose,
         f"obj_{side}_id": Path(str(dirs[slot])).name,

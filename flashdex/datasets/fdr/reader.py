@@ -4,7 +4,7 @@ A clip holds per hand (s = left, right) ``mano_{s}_joints`` (T, 20, 3), named
 ``<finger>_<level>`` and sorted by name, ``mano_{s}_wrist_pos`` (T, 3) and ``..._rot``
 (T, 3, 3), ``obj_{s}_pose`` (T, 4, 4) and ``obj_{s}_id``, whose mesh is
 ``objects/<id>/visual.obj``, to be scaled by ``obj_{s}_scale``. Metres, z up. A packed
-``motion.pt`` is read where a folder has no clips (``fdr_pack``).
+``motion.pt`` is read where a folder has no clips (``fdr.pack``).
 """
 
 from __future__ import annotations
@@ -79,7 +79,6 @@ def read_packed(file: Path, row: int, folders: tuple[Path, ...]) -> list[HumanDe
 
 
 def _find(path: Path) -> tuple[list[Path], Path | None]:
-    """The clips, or the packed collection."""
     if path.is_file():
         return ([path], None) if path.suffix == ".npz" else ([], path)
     for folder in (path / CLIP_FOLDERS[0], path, path / CLIP_FOLDERS[1]):

@@ -44,11 +44,7 @@ class Mask:
 def read_poses(file: Path) -> dict[str, Track]:
     """Poses of ``dynamic_objects.csv`` or ``headset_trajectory.csv``.
 
-    Returns:
-        By uid, in the order of the file: position (m), quaternion wxyz, (N, 7).
-
-    Raises:
-        DemoError: the file is missing, has other columns, or a cell is no number.
+    By uid, in the order of the file: position (m), quaternion wxyz, (N, 7).
     """
     rows: dict[str, list[tuple[int, list[float]]]] = {}
     for line, (uid, time, *pose) in _table(file, POSE_COLUMNS):
@@ -79,15 +75,8 @@ def read_mask(file: Path) -> Mask | None:
 def read_hands(file: Path, widths: dict[str, int]) -> dict[Side, Track]:
     """Hand poses of a ``.jsonl`` trajectory; a line may lack either hand.
 
-    Args:
-        file: one JSON a line.
-        widths: the fields wanted beside ``wrist_xform``, and their lengths.
-
-    Returns:
-        Per hand that occurs: wrist position (m), quaternion wxyz, then the fields.
-
-    Raises:
-        DemoError: the file is missing, or names the first line that is wrong.
+    ``widths`` names the fields wanted beside ``wrist_xform``, and their lengths. Per
+    hand that occurs: wrist position (m), quaternion wxyz, then the fields.
     """
     rows: dict[Side, list[tuple[int, list[float]]]] = {side: [] for side in SIDES}
     for number, line in enumerate(read_lines(file), start=1):
@@ -124,16 +113,11 @@ def _hand_row(hand: dict[str, Any], widths: dict[str, int]) -> list[float]:
 
 
 def _cells(file: Path, line: int) -> AbstractContextManager[None]:
-    fault = "not a row of this file (download it again)"
-    return told(f"{file}, line {line}", fault)
+    return told(f"{file}, line {line}", "not a row of this file (download it again)")
 
 
 def read_lines(file: Path) -> list[str]:
-    """Lines of a text file.
-
-    Raises:
-        DemoError: it is missing (the message lists what is there), or no text.
-    """
+    """Lines of a text file; where it is missing, the message lists what is there."""
     try:
         refuse_pointer(file)
         return file.read_text(encoding="utf-8").splitlines()
@@ -174,10 +158,8 @@ def _table(file: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str
 
 def _track(rows: list[tuple[int, list[float]]], width: int) -> Track:
     rows = sorted(rows, key=lambda row: row[0])
-    times = np.array([time for time, _ in rows], dtype=np.int64)
-    return Track(
-        times, np.array([v for _, v in rows], dtype=np.float64).reshape(-1, width)
-    )
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, width)
+    return Track(np.array([time for time, _ in rows], dtype=np.int64), values)
 
 
 FPS = 30.0
@@ -193,9 +175,7 @@ MAX_SECONDS = 4 * 3600  # no session is longer: one wrong stamp would make it ye
 class FrameAxis:
     """Uniform frames at 30 fps."""
 
-    # stamp of each frame, ns, ascending, (T,); nominal where a frame was not
-    # recorded
-    times: np.ndarray
+    times: np.ndarray  # stamps, ns, ascending, (T,); nominal where not recorded
     recorded: np.ndarray  # frames that have a stamp of their own, (T,) bool
     fps: float  # the rate that was measured
     rule: str  # how doubled stamps were told apart
@@ -224,9 +204,8 @@ class FrameAxis:
     def allowed(self, mask: Mask | None, *, every_stream: bool) -> np.ndarray:
         """Frames that a mask does not forbid, (T,) bool.
 
-        Args:
-            mask: None allows all frames, and so does a frame without a row.
-            every_stream: all streams must allow a frame, else one is enough.
+        No mask allows all frames, and no row its frame. With ``every_stream`` all
+        streams must allow a frame, else one is enough.
         """
         if mask is None:
             return np.ones(len(self.times), dtype=bool)
@@ -239,15 +218,10 @@ class FrameAxis:
 
 
 def frame_axis(name: str, tracks: Iterable[Track], mask: Mask | None) -> FrameAxis:
-    """The frames of a sequence.
+    """The frames of a sequence: the stamps of its objects' tracks.
 
-    Args:
-        name: of the sequence, for messages.
-        tracks: of the objects; their stamps are the frames.
-        mask: that says which stamps belong to which camera.
-
-    Raises:
-        DemoError: there are fewer than two frames, or the rate is not 30 fps.
+    The mask says which stamps belong to which camera. A ``DemoError`` where there are
+    fewer than two frames, or the rate is not 30 fps.
     """
     times = [track.times for track in tracks]
     stamps = np.unique(np.concatenate(times)) if times else np.zeros(0, dtype=np.int64)

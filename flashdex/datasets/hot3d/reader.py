@@ -27,15 +27,13 @@ from flashdex.datasets.hot3d.files import (
     read_poses,
 )
 from flashdex.datasets.hot3d.hands import read_keypoints
-from flashdex.datasets.hot3d.objects import (
+from flashdex.datasets.hot3d.world import (
     INSTANCES,
+    TEST_PARTICIPANTS,
     ObjectLibrary,
     find_library,
-    read_objects,
-)
-from flashdex.datasets.hot3d.world import (
-    TEST_PARTICIPANTS,
     read_metadata,
+    read_objects,
     refuse_without_truth,
     up_axis,
 )
@@ -82,7 +80,6 @@ def list_hot3d(options: SourceOptions) -> list[Recording]:
 
 
 def _find_sequences(root: Path) -> list[Path]:
-    """Folders of sequences: the root itself, in it, or in its groups."""
     if _is_sequence(root):
         return [root]
     groups = [root, *(root / name for name in GROUPS)]
@@ -124,7 +121,6 @@ def _wrong_root(root: Path) -> str:
 
 
 def _sequence_files(folder: Path) -> tuple[Path, ...]:
-    """Files of a sequence that decide its result, those that are there."""
     names = [OBJECTS_FILE, HEADSET_FILE, METADATA_FILE]
     hands = sorted(folder.glob("*_hand_*.json*"))
     masks = [_mask_file(folder, name) for name in MASKS]
@@ -150,14 +146,7 @@ def _library_files(folder: Path, library: ObjectLibrary) -> tuple[Path, ...]:
 def read_sequence(
     folder: Path, root: Path, library: ObjectLibrary, mano: Path | None
 ) -> list[HumanDemo]:
-    """One sequence, uncut, at 30 fps.
-
-    Args:
-        folder: of the sequence.
-        root: of the dataset.
-        library: of the object models.
-        mano: folder of the MANO models; None for UmeTrack keypoints.
-    """
+    """One sequence, uncut, at 30 fps; without MANO models by UmeTrack keypoints."""
     metadata = read_metadata(folder / METADATA_FILE)
     refuse_without_truth(folder, metadata, "umetrack" if mano is None else "mano")
     tracks = read_poses(folder / OBJECTS_FILE)
@@ -167,12 +156,8 @@ def read_sequence(
     objects, found = read_objects(
         folder.name, tracks, axis, objects_allowed, library, metadata.names
     )
-    up, measured = up_axis(
-        folder.name,
-        metadata.headset,
-        _headset(folder),
-        [track.values[:, :3] for track in tracks.values()],
-    )
+    places = [track.values[:, :3] for track in tracks.values()]
+    up, measured = up_axis(folder.name, metadata.headset, _headset(folder), places)
     keypoints, decided = read_keypoints(folder, axis, mano, allowed=hands_allowed)
     return [
         HumanDemo(
@@ -190,11 +175,10 @@ def read_sequence(
                 "headset": metadata.headset,
                 "participant": metadata.participant,
                 **({"version": metadata.version} if metadata.version else {}),
-                **_time_notes(axis),
-                **notes,
-                **measured,
-                **decided,
-                **found,
+                "fps": round(axis.fps, 3),
+                "stamps": axis.rule,
+                "unrecorded_frames": int((~axis.recorded).sum()),
+                **(notes | measured | decided | found),
             },
         )
     ]
@@ -215,16 +199,7 @@ def _apply_masks(
     return allowed[0], allowed[1], {"masked_frames": refused, "absent_masks": absent}
 
 
-def _time_notes(axis: FrameAxis) -> dict[str, Any]:
-    return {
-        "fps": round(axis.fps, 3),
-        "stamps": axis.rule,
-        "unrecorded_frames": int((~axis.recorded).sum()),
-    }
-
-
 def _headset(folder: Path) -> np.ndarray:
-    """Positions of the headset, m, (T, 3); empty without its trajectory."""
     file = folder / HEADSET_FILE
     tracks = list(read_poses(file).values()) if file.is_file() else []
     return np.concatenate([t.values[:, :3] for t in tracks] or [np.zeros((0, 3))])

@@ -6,13 +6,14 @@ import ast
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flashdex.datasets.demo import QUAT_TOLERANCE
-from flashdex.datasets.fields import part, poses_from_matrices, require, to_array
+from flashdex.datasets.fields import poses_from_matrices, require, row, to_array
 from flashdex.datasets.files import load_pickle, read_json
 from flashdex.datasets.roots import find_mesh
 from flashdex.errors import DemoError
@@ -95,12 +96,7 @@ def _primitive(file: Path, key: str, item: Any) -> Primitive:
 
 
 def parse_intervals(key: str, *, where: Path | str) -> dict[Side, Interval]:
-    """Intervals of the left and the right hand from a key like ``(None, (0, 240))``.
-
-    Args:
-        key: text of a Python tuple; never evaluated.
-        where: file, for the message.
-    """
+    """Intervals of both hands from a key like ``(None, (0, 240))``, never evaluated."""
     try:
         value = ast.literal_eval(key.strip()) if len(key) <= MAX_KEY else None
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
@@ -219,13 +215,7 @@ def _read_hand(
     where = f"{file}: raw_mano"
     sizes = {f"{PREFIX[side]}__{name}": size for name, size in HAND_FIELDS.items()}
 
-    def read(entry: Any) -> np.ndarray:
-        parts = [
-            to_array(part(entry, key, where=where), size, what=f"{file}: {key}")
-            for key, size in sizes.items()
-        ]
-        return np.concatenate(parts)
-
+    read = partial(row, sizes=sizes, where=where, file=str(file))
     rows = _rows(by_frame, ids, read, sum(sizes.values()), where)
     if np.isnan(rows).all():
         raise DemoError(f"{file}: raw_mano has none of the mocap ids.", code="E_KEYS")

@@ -1,8 +1,13 @@
-"""One hand carries one object: grasp, approach, lift, move, turn, place, retreat."""
+"""One hand carries one object: grasp, approach, lift, move, turn, place, retreat.
+
+Every mesh has z up as it stands on the table, and its origin at the centre of its box.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -10,17 +15,113 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.body_models.human_hand import (
     FINGER_RADIUS,
-    OPEN,
     Grasp,
     GraspTarget,
     fit_grasp,
 )
-from flashdex.datasets.procedural.shapes import Shape
+from flashdex.objects.meshes import join_meshes
+
+Approach = Literal["top", "side"]
+
+
+@dataclass
+class Shape:
+    """A mesh and the grasp that suits it."""
+
+    mesh: trimesh.Trimesh  # metres, rest pose, centred
+    approach: Approach  # from above across the object, or from the side around it
+    height: float  # of the contacts above the object's lowest point, m
+    across: np.ndarray  # grasp axis in the object frame, unit, horizontal (3,)
+    fingers: int  # how many fingers oppose the thumb
+
+
+X_AXIS = np.array([1.0, 0.0, 0.0])
+
+
+def _centred(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    return mesh
+
+
+def box(rng: np.random.Generator) -> Shape:
+    """A box 4.5-6 cm wide across the grasp, longer along it."""
+    size = rng.uniform([0.045, 0.060, 0.055], [0.060, 0.085, 0.075])
+    return Shape(trimesh.creation.box(size), "top", 0.6 * size[2], X_AXIS, 3)
+
+
+def cylinder(rng: np.random.Generator) -> Shape:
+    """A standing cylinder of 5-6 cm diameter, held from the side."""
+    radius, height = rng.uniform(0.025, 0.030), rng.uniform(0.11, 0.14)
+    mesh = trimesh.creation.cylinder(radius, height, sections=48)
+    return Shape(mesh, "side", 0.60 * height, X_AXIS, 3)
+
+
+def sphere(rng: np.random.Generator) -> Shape:
+    """A ball of 5.5-6.5 cm diameter, held from above."""
+    radius = rng.uniform(0.0275, 0.0325)
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return Shape(mesh, "top", 0.95 * radius, X_AXIS, 3)
+
+
+def capsule(rng: np.random.Generator) -> Shape:
+    """A lying capsule, 4.5-5.5 cm thick and about 10 cm long along y."""
+    radius, length = rng.uniform(0.0225, 0.0275), rng.uniform(0.04, 0.06)
+    mesh = trimesh.creation.capsule(height=length, radius=radius, count=[24, 24])
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, X_AXIS))
+    return Shape(_centred(mesh), "top", radius, X_AXIS, 3)
+
+
+def bowl(rng: np.random.Generator) -> Shape:
+    """A small steep bowl of at most 6.5 cm diameter, held across from above."""
+    outer, height = rng.uniform(0.030, 0.0325), rng.uniform(0.045, 0.055)
+    wall, base = 0.005, 0.006
+    profile = [
+        [0.0, 0.0],
+        [0.75 * outer, 0.0],
+        [0.93 * outer, 0.35 * height],
+        [outer, height],
+        [outer - wall, height],
+        [0.93 * outer - wall, 0.35 * height],
+        [0.65 * outer, base],
+        [0.0, base],
+    ]
+    mesh = trimesh.creation.revolve(np.array(profile), sections=48)
+    return Shape(_centred(mesh), "top", 0.65 * height, X_AXIS, 3)
+
+
+def spoon(rng: np.random.Generator) -> Shape:
+    """A thick handle along y with a bulb at its end, resting on bulb and handle end."""
+    handle, bulb = rng.uniform(0.013, 0.015), rng.uniform(0.024, 0.027)
+    length = rng.uniform(0.11, 0.13)
+    stick = trimesh.creation.capsule(height=length, radius=handle, count=[20, 20])
+    head = trimesh.creation.icosphere(subdivisions=3, radius=bulb)
+    head.apply_scale([1.0, 1.0, 0.8])
+    stick.apply_translation([0.0, 0.0, -length])  # the bulb's centre is the origin
+    turn = trimesh.transformations.rotation_matrix
+    stick.apply_transform(turn(np.pi / 2, X_AXIS))
+    # both ends on the table: the handle falls by (0.8 bulb - handle) over its length
+    tilt = np.arcsin((0.8 * bulb - handle) / length)
+    mesh = join_meshes([stick, head])
+    mesh.apply_transform(turn(-tilt, X_AXIS))
+    mesh = _centred(mesh)
+    hits, _, _ = mesh.ray.intersects_location([[0, 0, 1.0]], [[0, 0, -1.0]])
+    height = hits[:, 2].mean() + 0.002 - mesh.bounds[0, 2]  # of the handle's axis
+    return Shape(mesh, "top", float(height), X_AXIS, 2)
+
+
+SHAPES: dict[str, Callable[[np.random.Generator], Shape]] = {
+    "box": box,
+    "cylinder": cylinder,
+    "sphere": sphere,
+    "capsule": capsule,
+    "bowl": bowl,
+    "spoon": spoon,
+}
+
 
 # nominal durations, s
 APPROACH, CLOSE, CARRY, RELEASE, RETREAT = 0.55, 0.30, 1.30, 0.25, 0.40
-# how far the hand is away at the beginning and the end, m
-STANDOFF = 0.10
+STANDOFF = 0.10  # m, how far the hand is away at the beginning and the end
 # palm inclination against the grasp axis, rad: fingers point downwards or around
 PALM_TILT = {"top": np.deg2rad(38), "side": np.deg2rad(35)}
 FINGER_PITCH = 0.020
@@ -99,15 +200,9 @@ def _object_path(
 def _hand_path(
     grasp: Grasp, shape: Shape, opening: np.ndarray, away: np.ndarray, rest: float
 ) -> np.ndarray:
-    """Keypoints in the object frame, (T, 21, 3)."""
     share = _largest_opening(grasp, rest)
     steps = np.linspace(0, 1, 33)
-    shapes = np.stack(
-        [
-            grasp.keypoints(grasp.angles + s * share * (OPEN - grasp.angles))
-            for s in steps
-        ]
-    )
+    shapes = np.stack([grasp.opened(step * share) for step in steps])
     place = np.clip(opening, 0, 1) * (len(steps) - 1)
     low = np.minimum(place.astype(int), len(steps) - 2)
     part = (place - low)[:, None, None]
@@ -121,8 +216,7 @@ def _hand_path(
 def _largest_opening(grasp: Grasp, rest: float) -> float:
     """Share of the open posture that keeps all fingers off the table."""
     for share in np.linspace(OPENING, 0.1, 9):
-        points = grasp.keypoints(grasp.angles + share * (OPEN - grasp.angles))
-        if points[:, 2].min() > -rest + FINGER_RADIUS:
+        if grasp.opened(share)[:, 2].min() > -rest + FINGER_RADIUS:
             return float(share)
     return 0.1
 

@@ -18,8 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.procedural.carry import CarryPlan, Track, carry_track
-from flashdex.datasets.procedural.shapes import SHAPES
+from flashdex.datasets.procedural.carry import SHAPES, CarryPlan, Track, carry_track
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import continuous, to_quat
 from flashdex.errors import UnknownSourceError
@@ -31,8 +30,7 @@ NOISE_RIGID = 0.0018  # m, of the whole hand
 NOISE_TURN = np.deg2rad(1.0)
 NOISE_POINT = 0.0015  # m, of each keypoint
 NOISE_SECONDS = 0.2
-# mirror plane of the left hand: all shapes are symmetric in x
-MIRROR = np.array([-1.0, 1.0, 1.0])
+MIRROR = np.array([-1.0, 1.0, 1.0])  # of the left hand: all shapes are symmetric in x
 HAND_X = 0.16  # m, how far beside the middle each hand works when both do
 
 
@@ -79,17 +77,12 @@ QUICKSTART = (
 def procedural(
     seed: int = 0, count: int | None = None, kinds: Sequence[str] = QUICKSTART
 ) -> list[HumanDemo]:
-    """Human demonstrations of the given kinds.
+    """Human demonstrations, named by their kind; repetitions get a number.
 
     Args:
-        seed: of everything; the same seed gives the same motions, and a motion does not
-            depend on how many others are made.
-        count: how many; the kinds are gone through in order, again and again. One of
-            each by default.
+        seed: of everything; a motion does not depend on how many others are made.
+        count: the kinds are gone through again and again; by default one of each.
         kinds: names in ``KINDS``.
-
-    Returns:
-        Motions named by their kind; repetitions get a number.
     """
     listed = _list(seed, count, kinds)
     return [demo for recording in listed for demo in recording.read()]

@@ -41,11 +41,9 @@ DOCUMENTED = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 ARCH = 8.0
 # another choice of axes must have an error smaller than this share of the documented
 CLEARLY_BETTER = 0.6
-# the bend at which a finger is measured out, rad; beyond it the chain is shrunk
-MAX_BEND = 1.9
+MAX_BEND = 1.9  # rad, to which a finger is measured out; beyond, the chain is shrunk
 NUM_BENDS = 200
-# a hand larger than this share of the nominal one is not a hand
-MAX_SIZE = 1.3
+MAX_SIZE = 1.3  # of the nominal hand; what is larger is not a hand
 THUMB_ACROSS = np.array([0.8, 0.6, 0.0])  # the thumb bends to the fingers and across
 
 
@@ -93,13 +91,8 @@ def fill_hand(
 def find_axes(tips: np.ndarray, side: Side) -> tuple[np.ndarray, dict]:
     """The palm's axes in the wrist frame: documented, or those the tips speak for.
 
-    Args:
-        tips: in the wrist frame, m, (T, 5, 3).
-        side: of the hand.
-
-    Returns:
-        Columns are the palm's axes, (3, 3); and the distance of the tips to those of
-        a nominal hand, m.
+    Tips in the wrist frame, m, (T, 5, 3). The palm's axes are columns, (3, 3); with
+    the distance of the tips to those of a nominal hand, m.
     """
     nominal = hand_keypoints(np.stack([OPEN, GRASP])).mean(0)[list(TIP_KEYPOINTS)]
     nominal = nominal * _mirror(side)
@@ -124,14 +117,8 @@ def pose_hand(tips: np.ndarray, side: Side) -> tuple[np.ndarray, dict]:
 
     Knuckles stand at nominal places, larger only if a tip were out of reach. The bend
     of the middle joint follows from the distance of tip and knuckle; the distal joint
-    bends along. What is left is taken up by stretching, so that tips are exact.
-
-    Args:
-        tips: in the palm frame, m, (T, 5, 3).
-        side: of the hand.
-
-    Returns:
-        Keypoints in the palm frame, (T, 21, 3), and the stretch of the bones (95 %).
+    bends along. What is left is taken up by stretching, so that tips are exact. Tips
+    (T, 5, 3) and keypoints (T, 21, 3) in the palm frame, m; with the stretch (95 %).
     """
     flip = _mirror(side)
     tips = tips * flip  # from here on a right hand

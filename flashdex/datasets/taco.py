@@ -1,4 +1,9 @@
-"""One sequence of TACO: its files, and what is read from them.
+"""Reads TACO: a tool, a target and both hands, 30 frames a second, z up.
+
+``Hand_Poses/(verb, tool, target)/<sequence>/`` holds ``<side>_hand.pkl`` (older: a
+folder ``<side>_hand`` of one file a frame) and ``<side>_hand_shape.pkl``;
+``Object_Poses/(verb, tool, target)/<sequence>/`` holds ``tool_<id>.npy`` and
+``target_<id>.npy``, (T, 4, 4), m; ``Object_Models/<id>_cm.obj`` are the meshes.
 
 MANO with the flat hand; ``hand_trans`` is the wrist. Meshes are centimetres, poses
 metres. The origin lies somewhere below the table, so no height is claimed.
@@ -6,27 +11,32 @@ metres. The origin lies somewhere below the table, so no height is claimed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flashdex.datasets.body_models.mano import load_mano
+from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fields import numbers, part, poses_from_matrices, to_array
-from flashdex.datasets.files import load_pickle, refuse_pointer, told
-from flashdex.datasets.roots import relative, scaled_mesh
+from flashdex.datasets.fields import numbers, part, poses_from_matrices, row, to_array
+from flashdex.datasets.files import load_pickle, refuse_clone, refuse_pointer, told
+from flashdex.datasets.roots import relative, require_folders, scaled_mesh
+from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 
 NUM_POSE, NUM_BETAS = 48, 10
+FRAME = {"hand_pose": NUM_POSE, "hand_trans": 3}  # axis-angle, rad; wrist position, m
 FPS = 30.0
 HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
 ROLES = ("tool", "target")
 MESH_SCALE = 0.01  # centimetres to metres
 MAX_TRIM = 2  # frames by which tracks of a sequence may differ in length
-LICENCE = "TACO, CC BY 4.0"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +99,8 @@ def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
         fps=FPS,
         keypoints=keypoints,
         objects=[DemoObject(b.name, b.mesh, b.pose[:frames]) for b in objects],
-        source="taco",
-        licence=LICENCE,
+        source=SOURCE.name,
+        licence="TACO, CC BY 4.0",
         split=sequence.split,
         task=", ".join(sequence.words),
         provenance={
@@ -105,7 +115,6 @@ def read_sequence(sequence: TacoSequence) -> list[HumanDemo]:
 
 
 def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarray:
-    """Keypoints, m, (T, 21, 3)."""
     files = sequence.hand_files(side)
     if not files:
         raise DemoError(
@@ -124,7 +133,7 @@ def _read_hand(sequence: TacoSequence, side: Side, notes: list[str]) -> np.ndarr
         frames = [(str(file), load_pickle(file)) for file in files]
     else:
         frames = _all_frames(files[0])
-    table = np.stack([_frame_row(frame, where=where) for where, frame in frames])
+    table = np.stack([row(frame, FRAME, where=where) for where, frame in frames])
     return load_mano(sequence.mano, side).keypoints_of(
         table[:, :3],
         table[:, 3:NUM_POSE],
@@ -149,20 +158,8 @@ def _all_frames(file: Path) -> list[tuple[str, Any]]:
 
 
 def _frame_order(key: object) -> tuple[int, str]:
-    """Time order of frame keys, with or without leading zeros."""
     text = str(key)
     return (int(text) if text.isdecimal() and len(text) < 20 else -1, text)
-
-
-def _frame_row(frame: Any, *, where: str) -> np.ndarray:
-    """Axis-angle, rad, then wrist position, m, (51,)."""
-    sizes = {"hand_pose": NUM_POSE, "hand_trans": 3}
-    return np.concatenate(
-        [
-            to_array(part(frame, key, where=where), size, what=f"{where}: {key}")
-            for key, size in sizes.items()
-        ]
-    )
 
 
 def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObject:
@@ -213,3 +210,116 @@ def _common_length(
     if longest > shortest:
         notes.append(f"E_LEN: trimmed to {shortest} frames: {counts}")
     return shortest
+
+
+MESH_FOLDERS = (
+    "Object_Models",
+    "Object_Models/object_models_released",
+    "object_models_released",
+)
+MESH_SUFFIX = "_cm.obj"
+TRIPLET = re.compile(r"\([^,]+, [^,]+, [^)]+\)")
+SPLIT_LINE = re.compile(r"(\d{8}_\d+),(\w+)")
+SPLIT_LIST = "v1_overall_data_train_test_split.txt"
+
+logger = logging.getLogger(__name__)
+
+
+def list_taco(options: SourceOptions) -> list[Recording]:
+    """All sequences that have hands or objects, in name order."""
+    root, mano = options.folder("path"), options.folder("mano")
+    require_folders(root, (HANDS, OBJECTS), dataset="TACO")
+    meshes = _find_meshes(root, options.models)
+    models = mano_pair(mano)
+    folders = sorted({*_folders(root / HANDS), *_folders(root / OBJECTS)})
+    splits = _read_splits(options.splits, folders) if options.splits else {}
+    recordings = []
+    for folder, name in zip(folders, _unique_names(folders), strict=True):
+        split = splits.get(Path(folder).name, "")
+        whole = TacoSequence(
+            root=root, folder=folder, name=name, split=split, meshes=meshes, mano=mano
+        )
+        recordings.append(_recording(whole, models))
+    # an unfetched repository consists of pointers only
+    refuse_clone(recordings[0].files if recordings else ())
+    return recordings
+
+
+def _recording(whole: TacoSequence, models: tuple[Path, ...]) -> Recording:
+    ids = [mesh_id(file) for role in ROLES for file in whole.pose_files(role)]
+    # only the meshes it uses: a recording goes to another process
+    used = {key: whole.meshes[key] for key in ids if key in whole.meshes}
+    sequence = replace(whole, meshes=used)
+    return Recording(
+        name=sequence.name,
+        read=partial(read_sequence, sequence),
+        files=(*sequence.files(), *models),
+        key=f"{sequence.folder} {sequence.split}",
+    )
+
+
+def _find_meshes(root: Path, extra: Path | None) -> dict[str, Path]:
+    places = [root / folder for folder in MESH_FOLDERS]
+    places = places if extra is None else [extra, *places]
+    found: dict[str, Path] = {}
+    for place in places:
+        for file in sorted(place.glob(f"*{MESH_SUFFIX}")):
+            found.setdefault(file.name.removesuffix(MESH_SUFFIX), file)
+    if not found:
+        sought = ", ".join(str(place) for place in places)
+        raise DemoError(
+            f"{root}: no meshes <id>{MESH_SUFFIX}. Sought in {sought}. "
+            f"Download Object_Models, or name its folder with --models.",
+            code="E_ROOT",
+        )
+    return found
+
+
+def _folders(root: Path) -> list[str]:
+    """``(verb, tool, target)/<sequence>`` of all sequences below a folder."""
+    found = []
+    for triplet in sorted(entry for entry in root.iterdir() if entry.is_dir()):
+        if not TRIPLET.fullmatch(triplet.name):
+            logger.warning("%s: not '(verb, tool, target)'; left out", triplet)
+            continue
+        found += [
+            f"{triplet.name}/{entry.name}"
+            for entry in triplet.iterdir()
+            if entry.is_dir() and not entry.name.startswith(".")
+        ]
+    return found
+
+
+def _unique_names(folders: list[str]) -> list[str]:
+    """Names of the sequences; the triplet is added where two share a name."""
+    counts = Counter(Path(folder).name for folder in folders)
+    names = []
+    for folder in folders:
+        triplet, sequence = folder.split("/")
+        words = re.sub(r"[^\w-]+", "_", triplet).strip("_")
+        names.append(sequence if counts[sequence] == 1 else f"{sequence}_{words}")
+    return names
+
+
+def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
+    with told(file, "not a readable list of splits"):
+        lines = file.read_text(encoding="utf-8").split()
+    matches = [SPLIT_LINE.fullmatch(line) for line in lines]
+    splits = {match[1]: match[2] for match in matches if match}
+    known = {Path(folder).name for folder in folders}
+    if None in matches or not known & set(splits):
+        fault = lines[matches.index(None)] if None in matches else "no sequence in use"
+        raise DemoError(
+            f"{file}: expected lines 'sequence,split' as in TACO's {SPLIT_LIST}, like "
+            f"'20231104_017,train'; found {fault!r}."
+        )
+    return splits
+
+
+SOURCE = Source(
+    name="taco",
+    list=list_taco,
+    about="TACO: Hand_Poses, Object_Poses and Object_Models of bimanual tool use",
+    licence="CC BY 4.0; MANO under its own licence (non-commercial research)",
+    needs=("path", "mano"),
+)

@@ -1,1 +1,0 @@
-"""TACO: sequences of two hands, a tool and a target."""

@@ -11,7 +11,7 @@ from no_sync import forbid_sync
 from torchrl.envs.utils import step_mdp
 
 from flashdex import keys
-from flashdex.envs.mdp.assist import AssistConfig
+from flashdex.envs.mdp.assist import AssistConfig, AssistEpoch
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import LOOK_EVERY, EpisodeRecorder
@@ -39,6 +39,7 @@ def make_trainer(make_bench, tmp_path):
         env = unseen(bench.make_env())
         task = TrackingTask(bench)
         task.env, task.recorder = env, EpisodeRecorder(env)
+        task.assist_epoch = AssistEpoch(env.terms.gates)
         task.ledger = Ledger(
             tmp_path, bench.bank.names, criterion="sr_mt_obj", seed=0, engine=engine
         )

@@ -16,10 +16,7 @@ def known_algorithms() -> dict[str, type[Learner]]:
 
 
 def find_algorithm(kind: str) -> type[Learner]:
-    """The algorithm of a name.
-
-    Args:
-        kind: ``algo.kind`` of a recipe.
+    """The algorithm of an ``algo.kind``.
 
     Raises:
         FlashdexError: no such algorithm is registered.

@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.footprint import Footprint, Networks
 
 if TYPE_CHECKING:
     from torchrl.envs.transforms import Transform
@@ -22,25 +23,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSpec:
-    """What a learner is told of the task that it is built for.
+    """What a learner is told of the task that it is built for."""
 
-    Attributes:
-        example: one state of every world, batch (N,), on ``device``.
-        action_dim: actions of one hand J, or of the environment A.
-        vector_steps: budget of the run, steps of all worlds together.
-        seed: of networks, exploration and replay.
-        device: where the learner lives.
-        bank: reference frames, on ``device``; None without motions.
-        transforms: observation transforms in data-flow order.
-    """
-
-    example: TensorDictBase
-    action_dim: int
-    vector_steps: float
-    seed: int
-    device: torch.device
-    bank: ReferenceBank | None = None
-    transforms: list[Transform] = field(default_factory=list)
+    example: TensorDictBase  # one state of every world, batch (N,), on ``device``
+    action_dim: int  # actions of one hand J, or of the environment A
+    vector_steps: float  # budget of the run, steps of all worlds together
+    seed: int  # of networks, exploration and replay
+    device: torch.device  # where the learner lives
+    bank: ReferenceBank | None = None  # on ``device``; None without motions
+    transforms: list[Transform] = field(default_factory=list)  # in data-flow order
 
 
 class Learner(ABC):
@@ -48,31 +39,23 @@ class Learner(ABC):
 
     Actions, rewards and flags are (N, 2, J), (N, 2) and (N, 1) where two hands act, and
     (N, A), (N, 1) and (N, 1) on stock environments.
-
-    Attributes:
-        config_class: schema of the algorithm's part of a recipe.
-        tasks: kinds of recipes that it can train.
-        immutable_keys: recipe keys that give networks and statistics their meaning,
-            which a running run may not change.
-        has_replay: it learns from a buffer of ``config.buffer_size`` rows.
-        is_off_policy: it may learn between acting and storing the outcome; an
-            on-policy learner must not change before the rollout is complete.
-        buffer: its replay buffer, a `RowBuffer`; None without one.
-        last_update: what the last update was fed with, if that is kept; see ``redo``.
     """
 
     config_class: ClassVar[type[AlgoConfig]] = AlgoConfig
-    tasks: ClassVar[tuple[str, ...]] = ("retarget",)
+    tasks: ClassVar[tuple[str, ...]] = ("retarget",)  # recipes that it can train
+    # Recipe keys that give networks and statistics their meaning; they stay in a run.
     immutable_keys: ClassVar[tuple[str, ...]] = (
         "algo.kind",
         "algo.groups",
         "algo.v_max",
     )
-    has_replay: ClassVar[bool] = False
+    has_replay: ClassVar[bool] = False  # learns from ``config.buffer_size`` rows
+    # It may learn between acting and storing the outcome; an on-policy learner must
+    # not change before the rollout is complete.
     is_off_policy: ClassVar[bool] = False
     device: torch.device
-    buffer: Any = None
-    last_update: dict[str, Any] | None = None
+    buffer: Any = None  # its `RowBuffer`, if any
+    last_update: dict[str, Any] | None = None  # its batch and draws, if kept
 
     @abstractmethod
     def __init__(self, config: Any, spec: TaskSpec) -> None: ...
@@ -94,11 +77,9 @@ class Learner(ABC):
 
     @abstractmethod
     def act(self, state: TensorDictBase, *, explore: bool = True) -> Tensor:
-        """Actions in states, batch (N,); attempt worlds act deterministically.
+        """Actions in states, batch (N,), of two hands compact with ``attempt`` flag.
 
-        Args:
-            state: of two hands compact, with the ``attempt`` flag.
-            explore: False makes every world deterministic.
+        Attempt worlds act deterministically, without ``explore`` all do.
         """
 
     @abstractmethod
@@ -141,6 +122,13 @@ class Learner(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore ``state_dict``."""
 
+    def rehearse(self, config: Any, state: TensorDictBase) -> Footprint:
+        """Memory that the algorithm takes, nothing where it does not tell.
+
+        ``config`` is that of the run; the learner is a narrow copy with some rows.
+        """
+        return Footprint(Networks(0, 0, 0), 0, lambda size: (0, 0.0))
+
     def metrics(self) -> dict[str, float]:
         """What a record of a stock environment says of the learner."""
         return {}
@@ -149,10 +137,7 @@ class Learner(ABC):
     def conflicts(cls, config: Any, budget: int, worlds: dict[str, int]) -> list[str]:
         """One line for each thing in a recipe that does not fit together.
 
-        Args:
-            config: algorithm part of the recipe.
-            budget: env steps of the run.
-            worlds: their number, by the recipe key that gives it.
+        ``budget`` is in env steps; ``worlds`` their number, by the key that gives it.
         """
         problems = []
         if config.lr_final > config.lr:
@@ -174,7 +159,7 @@ class Learner(ABC):
     @classmethod
     def row_count(cls, config: Any, num_envs: int) -> int:
         """Transitions it keeps at most: those of the buffer or of a rollout."""
-        return config.buffer_size
+        return config.buffer_size if cls.has_replay else 0
 
     @classmethod
     def batch_rows(cls, config: Any, num_envs: int) -> int:

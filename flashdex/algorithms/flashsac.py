@@ -1,8 +1,9 @@
-"""FlashSAC: networks, loss and optimisers of a recipe, and replay around them."""
+"""FlashSAC as a learner: an agent, and replay around it."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -10,150 +11,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from flashdex.algorithms.agent import FlashSACAgent, make_networks, walk_update
 from flashdex.algorithms.base import Learner, TaskSpec, register, snapshot
 from flashdex.algorithms.config import AlgoConfig
-from flashdex.algorithms.inputs import FlatRows, HandRows, make_encoder
-from flashdex.modules.actor import FlashActor
-from flashdex.modules.critic import EnsembleCritic
-from flashdex.modules.exploration import NoiseRepetition
-from flashdex.modules.layers import restore_generator, warm_up_statistics
-from flashdex.modules.policy import FlashPolicy
-from flashdex.modules.product import tf32_products
+from flashdex.algorithms.footprint import Footprint, Networks, PeakMeter, tensor_bytes
+from flashdex.algorithms.inputs import FlatRows, HandRows
+from flashdex.modules.layers import restore_generator
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.objectives.reward_normalizer import RewardNormalizer
-from flashdex.objectives.stepper import FlashSACStepper
-from flashdex.replay.buffer import STAGES, HostBuffer, RowBuffer, check_pinning
+from flashdex.replay.buffer import STAGES, RowBuffer, check_pinning
 from flashdex.replay.codec import RowPatch
 from flashdex.replay.nstep import NStepAssembler
-
-
-def make_actor(
-    config: AlgoConfig,
-    observation_dim: int,
-    action_dim: int,
-    num_groups: int,
-    future_shape: tuple[int, int] | None,
-) -> FlashActor:
-    """The towers of all groups, with an encoder each."""
-    return FlashActor(
-        observation_dim,
-        action_dim,
-        num_groups=num_groups,
-        width=config.actor_width,
-        num_blocks=config.actor_blocks,
-        head=config.head,
-        init_std=config.init_std if config.head == "centred" else None,
-        future_encoder=make_encoder(config, future_shape, num_groups),
-    )
-
-
-def make_critic(
-    config: AlgoConfig,
-    observation_dim: int,
-    action_dim: int,
-    num_groups: int,
-    future_shape: tuple[int, int] | None,
-) -> EnsembleCritic:
-    """The twin critics of all groups; they share one encoder."""
-    return EnsembleCritic(
-        observation_dim,
-        action_dim,
-        num_groups=num_groups,
-        width=config.critic_width,
-        num_blocks=config.critic_blocks,
-        num_atoms=config.num_atoms,
-        v_max=config.v_max,
-        critic_action=config.critic_action,
-        future_encoder=make_encoder(config, future_shape, 1),
-    )
-
-
-class FlashSACAgent:
-    """Networks, loss, optimisers and policy; it knows sizes and groups, no environment.
-
-    Args:
-        config: algorithm part of the recipe.
-        rows: sizes and group names.
-        num_envs: worlds that are collected from.
-        total_updates: horizon of the learning-rate schedule.
-        generator: of the exploration and policy noise, on the device of everything.
-    """
-
-    def __init__(
-        self,
-        config: AlgoConfig,
-        rows: HandRows | FlatRows,
-        *,
-        num_envs: int,
-        total_updates: int,
-        generator: torch.Generator,
-    ) -> None:
-        self.config, self.device = config, generator.device
-        number = 1 if rows.names is None else len(rows.names)
-        sizes = (rows.observation_dim, rows.action_dim, number, rows.future_shape)
-        self.actor = make_actor(config, *sizes)
-        critic = make_critic(config, *sizes)
-        if config.norm_warmup:
-            warm_up_statistics(self.actor)
-            warm_up_statistics(critic)
-        self.normalizer = RewardNormalizer(
-            num_envs, number, gamma=config.gamma, bound=config.v_max
-        )
-        self.loss = FlashSACLoss(
-            self.actor,
-            critic,
-            groups=rows.names,
-            gamma=config.gamma,
-            n_steps=config.n_step,
-            alpha_init=config.alpha_init,
-            target_sigma=config.target_std,
-            reward_normalizer=self.normalizer,
-            own_action_gate=config.own_action_gate,
-        )
-        # drawn on the CPU, so that a seed means the same weights on every device
-        self.loss.to(self.device)
-        self.stepper = FlashSACStepper(
-            self.loss,
-            lr=config.lr,
-            lr_end=config.lr_final,
-            total_updates=total_updates,
-            actor_lr_scale=config.actor_lr_scale,
-            actor_period=config.actor_period,
-            actor_delay=config.actor_delay,
-            tau=config.tau,
-            generator=generator,
-            compile=config.compile,
-            autocast=config.bfloat16,
-        )
-        noise = NoiseRepetition(
-            exponent=config.noise_exponent,
-            maximum=config.noise_max_repeat,
-            clock=config.noise_clock,
-            generator=generator,
-        ).to(self.device)
-        self.policy = FlashPolicy(
-            self.actor,
-            groups=rows.names,
-            noise=noise,
-            deterministic_key=rows.deterministic_key,
-        )
-
-    def update(self, batch: TensorDictBase) -> TensorDict:
-        """One FlashSAC update on a sampled batch; returns its metrics."""
-        with tf32_products(self.config.tf32 and self.device.type == "cuda"):
-            return self.stepper.update(batch)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, optimisers, normaliser, generator and noise clock."""
-        return {
-            "stepper": self.stepper.state_dict(),
-            "noise": self.policy.noise.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore ``state_dict``."""
-        self.stepper.load_state_dict(state["stepper"])
-        self.policy.noise.load_state_dict(state["noise"])
 
 
 @register("flashsac")
@@ -338,6 +205,35 @@ class FlashSACLearner(Learner):
         if sampler is not None and self.buffer.generator is not self.generator:
             restore_generator(self.buffer.generator, sampler)
 
+    def rehearse(self, config: AlgoConfig, state: TensorDictBase) -> Footprint:
+        """See ``Learner.rehearse``; an observation is there while it is assembled."""
+        peaks = []
+        for count in (1, 2):
+            with PeakMeter() as meter:
+                batch = self.sample(count)[0]
+            peaks.append(meter.peak)
+        row, groups = batch[:1].to("meta"), self.rows.num_groups
+        with torch.device("meta"):
+            loss = FlashSACLoss(
+                *make_networks(config, self.rows), groups=self.rows.names
+            )
+
+        def update(size: int) -> tuple[int, float]:
+            batch = loss.read(row.expand(size))
+            noise = torch.randn(groups, size, self.rows.action_dim, device="meta")
+            peak, flops = walk_update(
+                loss,
+                batch,
+                noise,
+                lowered=config.bfloat16,
+                actor_period=config.actor_period,
+            )
+            return peak + tensor_bytes([batch, noise]), flops
+
+        ends = 2 * self.config.batch_size  # a row has two
+        slope = -(-(peaks[1] - peaks[0]) // ends)
+        return Footprint(Networks.of(loss), slope, lru_cache(update))
+
     @classmethod
     def conflicts(
         cls, config: AlgoConfig, budget: int, worlds: dict[str, int]
@@ -367,31 +263,27 @@ class FlashSACLearner(Learner):
 def make_buffer(
     config: AlgoConfig, *, device: torch.device, generator: torch.Generator, seed: int
 ) -> RowBuffer:
-    """The replay buffer of a recipe.
+    """The replay buffer of a recipe for a learner on ``device``.
 
-    Args:
-        config: algorithm part of the recipe.
-        device: of the learner.
-        generator: of the learner, on its device; it draws the samples as long as they
-            are drawn there, one after the other.
-        seed: of another one otherwise.
+    Samples are drawn by the learner's own generator as long as they are drawn on its
+    device, one after the other; otherwise by one of ``seed``.
 
     Raises:
         FlashdexError: pinned memory without a CUDA device, or it cannot be had.
     """
-    sizes = {"batch_size": config.batch_size, "device": device}
-    if config.replay in ("auto", "device"):
-        return RowBuffer(config.buffer_size, generator=generator, **sizes)
-    pinned = config.replay == "pinned"
+    pinned, on_host = config.replay == "pinned", config.replay in ("pinned", "cpu")
+    prefetch = config.prefetch if on_host else 0
     if pinned:
         check_pinning(device)
-    if device.type != "cpu" or config.prefetch:
+    if on_host and (device.type != "cpu" or prefetch):
         generator = torch.Generator().manual_seed(seed)
-    return HostBuffer(
+    return RowBuffer(
         config.buffer_size,
+        batch_size=config.batch_size,
+        device=device,
         generator=generator,
-        prefetch=config.prefetch,
+        on_host=on_host,
         stages=STAGES if pinned else 0,
+        prefetch=prefetch,
         pinned=pinned,
-        **sizes,
     )

@@ -45,16 +45,11 @@ class HandGroups:
 
     A hand that no motion of the collection uses belongs to no group: it needs no actor
     and no critic, and its action is zero.
-
-    Attributes:
-        names: of the groups G, in tower order.
-        hands: indices of the hands that act, [left, right] order.
-        action_dim: actions A of one group.
     """
 
-    names: tuple[str, ...]
-    hands: tuple[int, ...]
-    action_dim: int
+    names: tuple[str, ...]  # of the groups G, in tower order
+    hands: tuple[int, ...]  # indices of those that act, [left, right] order
+    action_dim: int  # actions A of one group
 
     @property
     def _range(self) -> slice:
@@ -103,12 +98,7 @@ class HandGroups:
 
 
 class HandRows:
-    """Two hands: observations by transforms, packed rows, one group a hand or both.
-
-    Args:
-        config: algorithm part of the recipe.
-        spec: of a task with motions.
-    """
+    """Two hands: observations by transforms, packed rows, one group a hand or both."""
 
     ones = ("flags",)  # leaves that are 1 in a blank row
     samples_ahead = True  # a sample of several updates costs little more than one
@@ -119,6 +109,8 @@ class HandRows:
         self.bank, self.codec = spec.bank, RowCodec(spec.bank)
         self.groups = HandGroups.of(self.bank, unified=config.groups == "unified")
         self.names: tuple[str, ...] | None = self.groups.names
+        self.num_groups = len(self.groups.names)
+        self.join, self.rewards = self.groups.join, self.groups.rewards
         self.action_dim = self.groups.action_dim
         self.transforms = [t.to(spec.device) for t in spec.transforms]
         # one compiled function a batch size
@@ -137,17 +129,9 @@ class HandRows:
         """What the policy reads of compact states, (N,)."""
         return self.assemble(state).set(keys.ATTEMPT, state[keys.ATTEMPT])
 
-    def join(self, td: TensorDictBase) -> Tensor:
-        """Actions of all groups, (N, 2, J)."""
-        return self.groups.join(td)
-
     def keep(self, state: TensorDictBase) -> TensorDictBase:
         """Entries of a state that rows need."""
         return state.select(*keys.STATE)
-
-    def rewards(self, reward: Tensor) -> Tensor:
-        """Rewards of the groups, (N, G)."""
-        return self.groups.rewards(reward)
 
     def mask(self, state: TensorDictBase, finite: Tensor) -> Tensor:
         """Whose rewards count for the statistics, (N, G) bool."""
@@ -184,17 +168,13 @@ NEXT_OBSERVATION = "next_observation"
 
 
 class FlatRows:
-    """One agent: the observation as it is, rows of float32.
-
-    Args:
-        config: algorithm part of the recipe.
-        spec: of a stock environment; states hold the ``observation``, (N, D).
-    """
+    """One agent: the ``observation`` (N, D) as it is, rows of float32."""
 
     ones = (keys.TERMINATED, keys.STEPS)
     samples_ahead = False
     deterministic_key = None
     names = None
+    num_groups = 1
     future_shape = None
 
     def __init__(self, config: AlgoConfig, spec: TaskSpec) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, cast
 
 import torch
@@ -11,6 +12,12 @@ from torch import Tensor, nn
 from flashdex import keys
 from flashdex.algorithms.base import Learner, TaskSpec, register, snapshot
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.footprint import (
+    Footprint,
+    Networks,
+    run_backward,
+    tensor_bytes,
+)
 from flashdex.algorithms.inputs import HandRows, make_encoder
 from flashdex.errors import RunError
 from flashdex.modules.gaussian_policy import GaussianPolicy, RunningNorm, ValueNet
@@ -282,6 +289,30 @@ class PPOLearner(Learner):
         self._updates = state["updates"]
         self._dropped.fill_(state["dropped"])
         self._rollout.clear()
+
+    def rehearse(self, config: AlgoConfig, state: TensorDictBase) -> Footprint:
+        """See ``Learner.rehearse``; an observation is kept.
+
+        It lies there raw, scaled, and as a copy for each group.
+        """
+        row: Any = self.inputs(state)[:1].to("meta")
+        agents = [nn.ModuleList([a.policy, a.value]) for a in self.agents.values()]
+        policy, value = one = agents[0].to("meta")
+
+        def update(size: int) -> tuple[int, float]:
+            rows = row.expand(size).clone()
+            seen = (rows[keys.OBSERVATION], rows.get(keys.FUTURE, None))
+
+            def compute() -> Tensor:
+                mean, std = policy(*seen)
+                return (mean / std).sum() + value(*seen).sum()
+
+            peak, flops = run_backward(compute, one)
+            return peak + tensor_bytes(seen), flops
+
+        each = (2 + len(agents)) * tensor_bytes(list(row.values()))
+        networks = Networks.of(nn.ModuleList(agents))
+        return Footprint(networks, each, lru_cache(update))
 
     @classmethod
     def gentler(cls, config: AlgoConfig) -> str:

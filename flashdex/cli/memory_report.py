@@ -97,7 +97,7 @@ def _on_card(plan: MemoryPlan, machine: Machine) -> str:
 def format_work(plan: MemoryPlan) -> str:
     """Arithmetic of an update, and the rate at which the worlds ask for updates."""
     algo = plan.recipe.algo
-    _, flops = plan.sizes.update(algo.batch_size)
+    _, flops = plan.sizes.learner.update(algo.batch_size)
     rate = 1000 * algo.updates_per_step / plan.recipe.env.num_envs
     return (
         f"work: an update is {flops / 1e9:,.1f} GFLOP of matrix products; every 1,000 "

@@ -62,16 +62,24 @@ STAGES = 2
 
 
 class RowBuffer(ReplayBuffer):
-    """Rows on the learner's device, where the sampling indices are drawn, too.
+    """A ring of packed rows on the learner's device, or in host memory beside it.
+
+    Rows for the host are copied without waiting for them. They can be sampled
+    ``stages`` pushes later: never before they have arrived, and always at the same
+    push. Threads gather whole batches ahead, under the lock that writing takes, so that
+    no row is ever read half written.
 
     Args:
         capacity: rows of the ring.
         batch_size: rows B of one batch.
         device: of the learner.
-        generator: draws the samples.
-        kept_on: where the rows are kept instead.
+        generator: draws the samples, where the rows are; with ``prefetch`` nobody else
+            may draw from it.
+        on_host: keep the rows in host memory, whatever the learner's device.
+        stages: pushes that rows may be on their way.
         prefetch: batches that threads gather ahead; 0 gathers when asked.
-        pinned: copy gathered rows into page-locked memory.
+        pinned: exchange rows through page-locked memory, which a CUDA device copies
+            from and to while host and device go on.
     """
 
     def __init__(
@@ -81,11 +89,14 @@ class RowBuffer(ReplayBuffer):
         batch_size: int,
         device: torch.device,
         generator: torch.Generator,
-        kept_on: torch.device | None = None,
+        on_host: bool = False,
+        stages: int = 0,
         prefetch: int = 0,
         pinned: bool = False,
     ) -> None:
-        self.ring = RowStorage(capacity, device=kept_on or device)
+        self.ring = RowStorage(
+            capacity, device=torch.device("cpu") if on_host else device
+        )
         super().__init__(
             storage=self.ring,
             writer=RowWriter(),
@@ -97,6 +108,10 @@ class RowBuffer(ReplayBuffer):
         )
         self.capacity, self.rows_per_batch = capacity, batch_size
         self.learner_device, self.generator = device, generator
+        self.on_host, self.pinned = on_host, pinned
+        self.stages, self.prefetch = stages, prefetch
+        self._crosses = on_host and device.type != "cpu"
+        self._coming: deque[tuple[TensorDict, torch.cuda.Event | None]] = deque()
 
     @property
     def num_rows(self) -> int:
@@ -104,71 +119,17 @@ class RowBuffer(ReplayBuffer):
         return len(self.ring)
 
     def push(self, rows: TensorDict) -> None:
-        """Store packed rows, (N,), of the learner's device.
+        """Take packed rows, (N,), of the learner's device; write what has arrived.
 
         Raises:
             FlashdexError: the ring does not fit into memory.
         """
-        try:
-            self.extend(rows)
-        except RuntimeError as error:
-            if self.ring.initialized:
-                raise
-            width = row_bytes(rows)
-            raise FlashdexError(
-                f"algo.buffer_size: {self.capacity} rows of {width} bytes are "
-                f"{self.capacity * width / 1e9:.1f} GB, which {self.ring.device} "
-                "cannot hold. Choose fewer rows, or on a CUDA device "
-                "algo.replay=pinned, which keeps them in host memory."
-            ) from error
-
-    def draw(self, count: int = 1) -> TensorDictBase:
-        """Rows of ``count`` batches on the learner's device, (count B,)."""
-        return self.sample(count * self.rows_per_batch)
-
-    def flush(self) -> None:
-        """Make every pushed row one that can be sampled and read."""
-
-
-class HostBuffer(RowBuffer):
-    """Rows in host memory, whatever the learner's device.
-
-    Rows that are pushed are copied to the host without waiting for them. They can be
-    sampled ``stages`` pushes later: never before they have arrived, and always at the
-    same push. Threads gather whole batches ahead, under the lock that writing takes, so
-    that no row is ever read half written.
-
-    Args:
-        capacity: rows of the ring.
-        stages: pushes that rows may be on their way.
-        pinned: exchange rows through page-locked memory, which a CUDA device copies
-            from and to while host and device go on.
-        options: of `RowBuffer`. The generator is on the host; with ``prefetch`` nobody
-            else may draw from it.
-    """
-
-    def __init__(
-        self,
-        capacity: int,
-        *,
-        stages: int = STAGES,
-        pinned: bool = False,
-        **options: Any,
-    ) -> None:
-        host = torch.device("cpu")
-        super().__init__(capacity, kept_on=host, pinned=pinned, **options)
-        self.prefetch = options.get("prefetch", 0)
-        self.stages, self.pinned = stages, pinned
-        self._coming: deque[tuple[TensorDict, torch.cuda.Event | None]] = deque()
-
-    def push(self, rows: TensorDict) -> None:
-        """Send packed rows, (N,), on their way; write those that must have arrived."""
         self._coming.append(self._send(rows))
         while len(self._coming) > self.stages:
             self._land()
 
     def _send(self, rows: TensorDict) -> tuple[TensorDict, torch.cuda.Event | None]:
-        if self.learner_device.type == "cpu":
+        if not self._crosses:
             return rows, None
         # The allocator of pinned memory hands the same few blocks out again.
         copies = {
@@ -187,17 +148,28 @@ class HostBuffer(RowBuffer):
         rows, event = self._coming.popleft()
         if event is not None:
             event.synchronize()
-        super().push(rows)
+        try:
+            self.extend(rows)
+        except RuntimeError as error:
+            if self.ring.initialized:
+                raise
+            width = row_bytes(rows)
+            raise FlashdexError(
+                f"algo.buffer_size: {self.capacity} rows of {width} bytes are "
+                f"{self.capacity * width / 1e9:.1f} GB, which {self.ring.device} "
+                "cannot hold. Choose fewer rows, or on a CUDA device "
+                "algo.replay=pinned, which keeps them in host memory."
+            ) from error
 
     def draw(self, count: int = 1) -> TensorDictBase:
         """Rows of ``count`` batches on the learner's device, (count B,)."""
         if not self.prefetch:
-            return self._to_learner(super().draw(count))
+            return self._to_learner(self.sample(count * self.rows_per_batch))
         batches: Any = [self._to_learner(self.sample()) for _ in range(count)]
         return batches[0] if count == 1 else cast(Any, torch.cat(batches))
 
     def _to_learner(self, rows: TensorDictBase) -> TensorDictBase:
-        if self.learner_device.type == "cpu":
+        if not self._crosses:
             return rows
         return rows.to(self.learner_device, non_blocking=self.pinned)
 
@@ -213,10 +185,7 @@ class HostBuffer(RowBuffer):
 
 
 def check_pinning(device: torch.device) -> None:
-    """Refuse pinned memory where there is none.
-
-    Args:
-        device: of the learner.
+    """Refuse pinned memory where a learner's device has none.
 
     Raises:
         FlashdexError: the learner is on no CUDA device, or pinning fails.

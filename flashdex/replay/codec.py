@@ -21,11 +21,9 @@ _MAX_SPEED = 1000.0  # m/s or rad/s; beyond it the episode has ended as insane a
 
 
 class RowCodec:
-    """Packs n-step rows and unpacks replay samples.
+    """Packs n-step rows as residuals to the reference, and unpacks replay samples.
 
-    Args:
-        bank: reference frames the residuals refer to.
-        half: store floats as float16; float32 otherwise.
+    Floats are stored as float16 if ``half``, as float32 otherwise.
     """
 
     def __init__(self, bank: ReferenceBank, *, half: bool = True) -> None:
@@ -35,14 +33,7 @@ class RowCodec:
         self._widths = [2 * joints] * 3 + [slots * 7, slots * 6]
 
     def pack(self, row: TensorDictBase) -> TensorDict:
-        """Pack N rows of ``NStepAssembler``.
-
-        Args:
-            row: state, action, reward, next_state, terminated, steps.
-
-        Returns:
-            TensorDict (N,) of few wide leaves.
-        """
+        """Pack N rows of ``NStepAssembler``: (N,) of few wide leaves."""
         state, after = row.get("state"), row.get("next_state")
         packed = {
             "state": self._pack_state(state),
@@ -133,11 +124,8 @@ class RowPatch:
     As many rows leave as come in, so the host need not know how many are bad: asking
     the device would stall it at every vector step. A bad row becomes a copy of the
     nearest sound row before it, else of the first sound one; where a whole step is bad,
-    of a sound row of an earlier step. Before there is any, it is a blank row.
-
-    Args:
-        device: of the rows.
-        ones: leaves that are 1 in a blank row, where all others are 0.
+    of a sound row of an earlier step. Before there is any, it is a blank row, 0 in all
+    leaves but 1 in ``ones``.
 
     Example:
         >>> patch = RowPatch(torch.device("cpu"))
@@ -163,15 +151,7 @@ class RowPatch:
         self._bad.fill_(value)
 
     def __call__(self, rows: TensorDict, good: Tensor) -> TensorDict:
-        """Patch the rows of one step.
-
-        Args:
-            rows: flat, batch (N,).
-            good: rows that are sound, (N,) bool.
-
-        Returns:
-            N sound rows, none of them shared with ``rows``.
-        """
+        """Sound rows (N,), copies, for those of one step, sound where ``good``."""
         size = len(good)
         self._bad += (~good).sum()
         own = torch.arange(size, device=good.device)
@@ -189,8 +169,9 @@ class RowPatch:
         return TensorDict(patched, batch_size=[size])
 
     def _blank(self, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        fresh = {True: torch.ones_like, False: torch.zeros_like}
-        return {k: fresh[k in self.ones](leaf[:1]) for k, leaf in leaves.items()}
+        return {
+            k: torch.full_like(leaf[:1], k in self.ones) for k, leaf in leaves.items()
+        }
 
 
 def finite_rows(row: TensorDictBase) -> Tensor:

@@ -43,12 +43,6 @@ class Segment:
         return self.first + self.rows
 
 
-def replay_of(learner: object) -> ReplayBuffer | None:
-    """The replay buffer of a learner, None when it keeps none."""
-    buffer = getattr(learner, "buffer", None)
-    return buffer if isinstance(buffer, ReplayBuffer) else None
-
-
 def _read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
@@ -56,12 +50,8 @@ def _read(path: Path) -> dict[str, Any]:
 class ReplayLog:
     """Stores and restores a one-dimensional ring buffer beside the checkpoints.
 
-    Args:
-        run_dir: run directory.
-        buffer: replay buffer of tensordict rows.
-        meaning: what the rows depend on (motions, rewards, ...); rows of another
-            meaning are not loaded.
-        enabled: False stores nothing, but still loads and deletes.
+    Rows of another ``meaning`` (motions, rewards, ...) are not loaded. When not
+    ``enabled`` it stores nothing, but still loads and deletes.
     """
 
     def __init__(
@@ -124,13 +114,10 @@ class ReplayLog:
         return out
 
     def load(self, stem: str) -> bool:
-        """Fill the empty buffer as it was at a checkpoint.
+        """Fill the empty buffer as it was at a checkpoint; a warning says why not.
 
         Equal capacity puts every row where it was, so that sampling goes on bit-equal;
         a smaller or larger ring takes the newest rows.
-
-        Returns:
-            Whether the rows are there; a warning says why not, unless none were stored.
         """
         path = self.folder / f"{stem}.json"
         if not path.is_file():

@@ -11,17 +11,12 @@ from torch import Tensor
 
 
 class NStepAssembler:
-    """Turns consecutive vector steps into n-step rows.
+    """Turns consecutive vector steps into rows of windows of at most ``n_step`` steps.
 
     Each push yields one row per world, for the step n - 1 pushes ago: the discounted
     sum of rewards up to the first episode end in the window, the state at the end of
     that window, its ``terminated`` flag and the true window length k, so that the
     bootstrap can be discounted by gamma^k.
-
-    Args:
-        n_step: longest window.
-        gamma: discount a step.
-        device: of the steps.
     """
 
     def __init__(

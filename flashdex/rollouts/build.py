@@ -25,17 +25,10 @@ def grace_steps(fps: float) -> int:
 
 
 class RolloutBuilder:
-    """Builds rollouts from recorded episodes, on the cpu.
+    """Builds rollouts from recorded episodes, on the CPU, where ``bank`` must be.
 
-    Args:
-        bank: reference frames, on the cpu.
-        hands: hand specs by side.
-        scenes: scene of each motion.
-        decimation: physics substeps of a control step.
-        criterion: what the rollouts are stored for.
-        seed: of the run.
-        made_by: engine, versions and hardware, from ``versions``.
-        provenance: hashes of recipe and library, date; stored with every rollout.
+    ``scenes`` has one a motion; ``made_by`` and ``provenance`` (hashes of recipe and
+    library, date) are stored with every rollout.
     """
 
     def __init__(

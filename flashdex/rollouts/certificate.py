@@ -48,32 +48,20 @@ DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
 
 @dataclass(frozen=True)
 class Certificate:
-    """The proof, or its failure, as plain data.
+    """The proof, or its failure, as plain data."""
 
-    Args:
-        verdict: ``certified`` (nominal run passes), ``robust`` (and at least 6 of 8
-            perturbed runs pass), ``failed`` or ``not_measured``.
-        reason: why not, or empty.
-        identity: schema, motion, criterion, engines and versions.
-        model: hashes, timestep, solver settings of the re-simulation.
-        inputs: sizes of the replayed sequence, stored and applied wrenches.
-        nominal: criterion -> verdict of the nominal run.
-        deviation: distance of the nominal run from the stored states.
-        perturbed: seed, sizes, runs, and per criterion the fraction that passed.
-        safety: penetration mm, force N, joint limits, warnings, NaN count.
-        provenance: seed, env steps, recipe and checkpoint hashes, hardware.
-    """
-
+    # certified (nominal run passes), robust (and 6 of 8 perturbed ones), failed or
+    # not_measured
     verdict: CertificateVerdict
-    reason: str
-    identity: dict[str, Any]
-    model: dict[str, Any]
-    inputs: dict[str, Any]
-    nominal: dict[str, dict[str, Any]]
-    deviation: dict[str, Any]
-    perturbed: dict[str, Any]
-    safety: dict[str, Any]
-    provenance: dict[str, Any]
+    reason: str  # why not, or empty
+    identity: dict[str, Any]  # schema, motion, criterion, engines and versions
+    model: dict[str, Any]  # hashes, timestep, solver settings of the re-simulation
+    inputs: dict[str, Any]  # sizes of the sequence, stored and applied wrenches
+    nominal: dict[str, dict[str, Any]]  # criterion -> verdict of the nominal run
+    deviation: dict[str, Any]  # of the nominal run from the stored states
+    perturbed: dict[str, Any]  # seed, sizes, runs, share that passed by criterion
+    safety: dict[str, Any]  # penetration mm, force N, joint limits, warnings, NaN
+    provenance: dict[str, Any]  # seed, env steps, hashes, hardware
 
     def to_json(self) -> str:
         """JSON text; numbers that are not finite become null."""

@@ -25,20 +25,8 @@ class Ledger:
     A stored rollout is on disk, complete, before its line is written: a crash can lose
     a line, never a conversion that has a line. ``adopt`` writes the line that is lost.
 
-    Args:
-        run_dir: run directory.
-        names: motions of the collection.
-        criterion: what counts as a conversion.
-        seed: of the run, for the lines.
-        engine: physics engine of the rollouts.
-        on_gpu: a GPU steps the physics, so that its seconds count.
-        certify: replay conversions and write the certificate.
-        trivial: motions that a baseline already passes.
-
-    Attributes:
-        conversions: motion -> line of its first pass, with the newest verdict.
-        attempts: motion -> number of lines.
-        last: motion -> whether its newest attempt passed.
+    Seconds count as a GPU's where one steps the physics (``on_gpu``). Conversions get a
+    certificate if ``certify``. ``trivial``: baselines that already pass a motion.
     """
 
     def __init__(
@@ -59,9 +47,10 @@ class Ledger:
         self.names, self.criterion, self.seed = names, criterion, seed
         self.engine, self.on_gpu = engine, on_gpu
         self.certify, self.trivial = certify, trivial or {}
+        # motion -> line of its first pass, with the newest verdict
         self.conversions: dict[str, dict[str, Any]] = {}
-        self.last: dict[str, bool] = {}
-        self.attempts: dict[str, int] = dict.fromkeys(names, 0)
+        self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
+        self.attempts: dict[str, int] = dict.fromkeys(names, 0)  # motion -> lines
         drop_cut_line(self.path)
         for line in read_lines(self.path):  # of earlier sessions
             # A resume may ask for another criterion, or for fewer motions.
@@ -70,10 +59,6 @@ class Ledger:
 
     def record(self, rollout: Rollout, *, wall_s: float) -> tuple[dict[str, Any], bool]:
         """Score one attempt, write its line and count it.
-
-        Args:
-            rollout: of a finished episode.
-            wall_s: seconds since the run began, earlier sessions included.
 
         Returns:
             The line, and whether this attempt is the motion's first that passes.
@@ -129,13 +114,7 @@ class Ledger:
         """Write the lines of stored rollouts that a crash left without one.
 
         Each is scored anew from its file alone. One that does not pass stays where it
-        is, without a line; a later conversion replaces it.
-
-        Args:
-            wall_s: clock of the run, for the lines.
-
-        Returns:
-            Motions whose lines were written.
+        is, without a line; a later conversion replaces it. Returns the motions told of.
         """
         lines = read_lines(self.path)
         told = {x["rollout"]: x["env_steps"] for x in lines if x.get("rollout")}

@@ -35,15 +35,11 @@ class Episode:
 
 
 class EpisodeRecorder:
-    """Records the attempt worlds of an environment.
+    """Records the first ``num_attempts`` worlds of an environment.
 
     Call ``record_start`` after resets and ``record_step`` after each environment step,
-    before the reset that follows it.
-
-    Args:
-        env: the environment; its first ``num_attempts`` worlds are recorded.
-        look_every: steps between two looks at the flags; when None every step where
-            that is free, every ``LOOK_EVERY`` where the host would wait.
+    before the reset that follows it. The flags are looked at every ``look_every``
+    steps: every one where that is free, ``LOOK_EVERY`` where the host would wait.
     """
 
     def __init__(self, env: TrackingEnv, *, look_every: int | None = None) -> None:
@@ -65,15 +61,9 @@ class EpisodeRecorder:
     def record_step(
         self, action: Tensor, done: Tensor, env_steps: int
     ) -> list[Episode]:
-        """Record the step that the environment has just made.
+        """Record the step that the environment has just made, and what has ended.
 
-        Args:
-            action: (N, 2, J).
-            done: (N, 1) bool.
-            env_steps: counter of the run.
-
-        Returns:
-            Episodes that are now known to have ended.
+        ``action`` is (N, 2, J), ``done`` (N, 1) bool, ``env_steps`` the run's counter.
         """
         result, raw = self.env.last_step, self.env.physics.raw()
         causes = {CAUSE + name: blame for name, blame in result.terminations.items()}

@@ -61,11 +61,7 @@ class Replay:
 
 
 def load_simulation(rollout: Rollout) -> Simulation:
-    """Compile the model of a rollout and find its parts; RunError when they are absent.
-
-    Args:
-        rollout: a checked rollout.
-    """
+    """Compile the model of a rollout and find its parts; RunError when absent."""
     motion = rollout.motion
     try:
         model = mujoco.MjModel.from_xml_string(rollout.model_xml)
@@ -153,12 +149,7 @@ def model_hash(model: mujoco.MjModel) -> str:
 
 
 def resimulate(sim: Simulation, *, monitor: StepMonitor | None = None) -> Replay:
-    """Apply the controls open loop from the first state.
-
-    Args:
-        sim: as stored, or perturbed.
-        monitor: called after every substep.
-    """
+    """Apply the controls open loop from the first state; monitor every substep."""
     model, rollout = sim.model, sim.rollout
     data = mujoco.MjData(model)
     data.qpos[:] = sim.qpos0
@@ -247,11 +238,7 @@ def perturb(
 ) -> Simulation:
     """The same rollout, a little disturbed: what a robust conversion survives.
 
-    Args:
-        sim: as stored.
-        sizes: of the disturbances.
-        seed: of the certificate.
-        index: number of the perturbed replay.
+    ``seed`` is the certificate's, ``index`` the number of the perturbed replay.
     """
     rng = np.random.default_rng([seed, index])
     model = _perturb_model(sim, rng, sizes)

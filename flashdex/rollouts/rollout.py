@@ -37,10 +37,6 @@ class Rollout:
     T control steps, O object slots, M joints of the criteria, 2 hands [left, right], 5
     fingers [thumb, index, middle, ring, pinky].
 
-    Attributes:
-        terminations: what ended the attempt early, ``cause`` and ``hand`` of each. The
-            ledger's line has them; the file has not.
-
     Example:
         >>> Rollout.load("runs/demo/rollouts/lift.npz").num_frames  # doctest: +SKIP
         240
@@ -86,6 +82,7 @@ class Rollout:
     provenance: str = "{}"  # JSON: hashes of recipe, library, checkpoint; date
 
     def __post_init__(self) -> None:
+        # what ended it early, cause and hand; in the ledger's line, not in the file
         self.terminations: list[dict[str, str]] = []
         if not self.model_sha256:
             self.model_sha256 = _sha256(self.model_xml)
@@ -117,10 +114,8 @@ class Rollout:
     ) -> TrackingErrors:
         """Errors of any states against the reference of this rollout.
 
-        Args:
-            states: object_pos, object_quat, fingertips, joints, wrist_pos, shaped as
-                the fields of those names; None where there is none.
-            overflow: the engine warned of numerics.
+        ``states`` are object_pos, object_quat, fingertips, joints, wrist_pos, shaped as
+        the fields of those names or None; ``overflow``: the engine warned.
         """
         reference = {f"ref_{name}": getattr(self, f"ref_{name}") for name in states}
         return compute_tracking_errors(
@@ -135,19 +130,13 @@ class Rollout:
     def score(self, *, completed: bool | None = None) -> dict[str, Verdict]:
         """Verdict of every criterion on the stored states.
 
-        Args:
-            completed: reached the end under the training terminations; None when they
-                are not known.
+        ``completed``: it reached the end under the training terminations, if known.
         """
         errors = self.tracking_errors()
         return score(errors, grace=self.grace, completed=completed)
 
     def summary(self, criterion: str) -> dict[str, Any]:
-        """What the ledger's line says of this attempt.
-
-        Args:
-            criterion: what counts as a conversion.
-        """
+        """What the ledger's line says of this attempt, scored by ``criterion``."""
         verdicts = self.score(completed=self.completed)
         verdict = verdicts[criterion]
         return {
@@ -165,11 +154,7 @@ class Rollout:
         }
 
     def validate(self, *, where: str = "rollout") -> None:
-        """Check shapes, JSON fields and the model hash; raise RunError on the first.
-
-        Args:
-            where: file name for the message.
-        """
+        """Check shapes, JSON fields and the model hash; RunError on the first fault."""
         sizes: dict[str, int] = {"T": len(self.ctrl)}
         for key, hint in _hints().items():
             value = getattr(self, key)

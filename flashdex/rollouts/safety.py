@@ -26,9 +26,7 @@ def geom_kinds(model: mujoco.MjModel, object_body: np.ndarray) -> np.ndarray:
 def assist_sources(model: mujoco.MjModel, object_body: np.ndarray) -> list[str]:
     """What in a model could carry an object besides contact: none is allowed.
 
-    Args:
-        model: compiled model.
-        object_body: body of each slot, -1 when empty, (O,).
+    ``object_body`` is the body of each slot, -1 when empty, (O,).
     """
     roots = model.body_rootid[object_body[object_body >= 0]]
     in_object = np.isin(model.body_rootid, roots)
@@ -60,10 +58,7 @@ def normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 class SafetyMonitor:
     """Collects peaks over all substeps; call it after every ``mj_step``.
 
-    Args:
-        model: compiled model.
-        object_body: body of each slot, -1 when empty, (O,).
-
+    ``object_body`` is the body of each slot, -1 when empty, (O,).
     """
 
     def __init__(self, model: mujoco.MjModel, object_body: np.ndarray) -> None:

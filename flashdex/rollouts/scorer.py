@@ -75,10 +75,8 @@ MakeScorer = Callable[[ScorerSpec], InlineScorer]
 class ProcessScorer:
     """Scores in a process of its own, which writes all lines and rollouts.
 
-    Args:
-        ledger: follows what the process writes; it must write nothing meanwhile.
-        spec: for the process.
-        make: what the process runs first.
+    ``ledger`` follows what the process writes; it must write nothing meanwhile. The
+    process first runs ``make`` on ``spec``.
     """
 
     def __init__(self, ledger: Ledger, spec: ScorerSpec, make: MakeScorer) -> None:
@@ -105,8 +103,7 @@ class ProcessScorer:
     def collect(self, *, wait: bool = False) -> list[str]:
         """Motions whose first passing attempt was found since the last call.
 
-        Args:
-            wait: until all episodes are scored and their lines written.
+        ``wait`` until all episodes are scored and their lines written.
 
         Raises:
             OSError: a file could not be written.

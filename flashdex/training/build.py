@@ -148,19 +148,12 @@ def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
 
 @dataclass(frozen=True)
 class RunBuilder:
-    """Builds the parts of a run: environment, learner, rollouts.
-
-    Attributes:
-        recipe: validated recipe.
-        library: prepared motions, selected ones only.
-        hands: hand specs by side.
-        bank: the library as tensors, on the device of the physics.
-    """
+    """Builds the parts of a run: environment, learner, rollouts."""
 
     recipe: Recipe
-    library: MotionLibrary
+    library: MotionLibrary  # prepared, selected motions only
     hands: dict[keys.Side, HandSpec]
-    bank: ReferenceBank
+    bank: ReferenceBank  # the library as tensors, on the device of the physics
 
     @classmethod
     def from_recipe(

@@ -36,16 +36,10 @@ def save_checkpoint(
     keep: int,
     replay: ReplayLog | None = None,
 ) -> Path:
-    """Write ``checkpoints/<env_steps>.pt`` in one piece and drop the oldest.
+    """Write ``checkpoints/<env_steps>.pt`` in one piece; the ``keep`` newest stay.
 
     Replay rows are on the disk before the checkpoint that needs them, and go after the
     last one that does: a crash in between leaves the former pair usable.
-
-    Args:
-        run_dir: run directory.
-        state: tensors and plain values; ``env_steps`` names the file.
-        keep: newest checkpoints that stay.
-        replay: rows to store beside it.
 
     Raises:
         OSError: the disk is full, say; the former checkpoints are as they were.
@@ -71,10 +65,7 @@ def save_checkpoint(
 def load_checkpoint(
     run_dir: Path, needs: Collection[str] = ("env_steps",)
 ) -> dict[str, Any]:
-    """Read the newest checkpoint of a run that can be read.
-
-    One that cannot (a full or failing disk) is named in a warning, and the one before
-    is taken.
+    """Read the newest checkpoint that can be read; a warning names those that cannot.
 
     Raises:
         RunError: there is none, none can be read, another version wrote it, or a key

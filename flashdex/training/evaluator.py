@@ -32,16 +32,9 @@ def roll_all(
 ) -> list[Rollout]:
     """Roll every motion once from frame 0, without assist, noise or terminations.
 
-    Args:
-        builder: motions and recipe.
-        controller: what acts.
-        env_steps: counter stored with the rollouts.
-        worlds: motions rolled side by side.
-        target: joint position targets (N, 2, J) that replace those of the action, for
-            controllers outside the action space.
-
-    Returns:
-        One rollout a motion, in library order.
+    One rollout a motion, in library order; ``worlds`` of them roll side by side.
+    ``target`` gives joint position targets (N, 2, J) in the place of those of the
+    action, for controllers outside the action space.
     """
     total = builder.bank.num_motions
     out: list[Rollout] = []

@@ -33,9 +33,7 @@ class NonFiniteError(Exception):
 def first_non_finite(state: Any, path: str = "") -> str:
     """Path of the first tensor or number that is not finite, empty when all are.
 
-    Args:
-        state: nested dicts, lists and tuples; keys of raw simulator states are skipped.
-        path: of ``state`` itself.
+    Keys of raw simulator states are skipped.
     """
     if isinstance(state, Mapping | TensorDictBase):
         items = [(k, v) for k, v in state.items() if k not in RAW]
@@ -75,10 +73,7 @@ class GradientGuard:
     On a CPU a gradient that is not finite raises before the step, so the weights are
     those before it. On a GPU nothing waits for the device: fused optimisers skip the
     step there by themselves, and ``check`` raises when it is next called.
-
-    Args:
-        waits: raise at once on a GPU, too, at the price of waiting for it; and False
-            never raises at once.
+    ``waits=True`` raises at once there, too; False never does.
     """
 
     def __init__(self, *, waits: bool | None = None) -> None:

@@ -39,6 +39,7 @@ class GymTask(Task):
     # checkpoints of earlier versions hold no more
     evaluated_keys = ("env_steps", "learner")
     resumed_keys = (*evaluated_keys, "wall_s", "wandb_id")
+    state_keys = (keys.OBSERVATION,)
     updates_during_step = False
 
     def __init__(self, recipe: GymRecipe) -> None:
@@ -194,15 +195,10 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class GymEvaluation:
-    """One episode of each world.
+    """One episode of each world."""
 
-    Attributes:
-        returns: undiscounted sums of raw rewards, (E,); those not finite count as 0.
-        lengths: steps, (E,).
-    """
-
-    returns: Tensor
-    lengths: Tensor
+    returns: Tensor  # undiscounted sums of raw rewards, (E,); not finite ones are 0
+    lengths: Tensor  # steps, (E,)
 
     def metrics(self) -> dict[str, float]:
         """What is logged of an evaluation."""
@@ -224,13 +220,10 @@ def evaluate_policy(
 ) -> GymEvaluation:
     """Play one episode in each world from its seed, without exploration.
 
-    Args:
-        learner: acts; neither its noise nor its statistics move.
-        env: one world an episode, of a limited length.
-        should_stop: asked before every vector step.
+    Neither noise nor statistics of the learner move.
 
     Raises:
-        StoppedError: ``should_stop`` said so.
+        StoppedError: ``should_stop`` said so; it is asked before every vector step.
     """
     returns = torch.zeros(env.num_envs, 1, dtype=torch.float64)
     lengths = torch.zeros(env.num_envs, 1, dtype=torch.int64)

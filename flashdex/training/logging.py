@@ -31,10 +31,8 @@ class MetricWriter(Protocol):
 class JsonlWriter:
     """Appends one JSON object a record to ``metrics.jsonl``.
 
-    Args:
-        run_dir: run directory.
-        env_steps: of the checkpoint a resumed run goes on from. Later records belong
-            to steps that are done again, and are removed.
+    Records beyond ``env_steps``, of the checkpoint that a resumed run goes on from,
+    belong to steps that are done again, and are removed.
     """
 
     def __init__(self, run_dir: Path, *, env_steps: int | None = None) -> None:

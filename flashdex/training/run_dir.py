@@ -299,14 +299,10 @@ def _open_replay(
 
 
 def reopen(path: str | Path) -> tuple[Learner, Callable[[], TensorDictBase]]:
-    """Build the learner of a ``nan_dump.pt`` and a function that repeats the failure.
+    """The learner of a ``nan_dump.pt`` as it was, and a function that fails again.
 
-    Args:
-        path: the dump, of a run whose motion library is still there.
-
-    Returns:
-        The learner as it was found, and a call without arguments that performs the
-        update again under the guard: NonFiniteError, or the metrics.
+    It performs the update again under the guard: NonFiniteError, or the metrics. The
+    motion library must still be there.
 
     Raises:
         RunError: no such file, not a dump, or a learner that keeps no batch.

@@ -28,17 +28,11 @@ SIGNAL = "signal"  # why a session ended, when a person or a scheduler ended it
 
 @dataclass(frozen=True)
 class SessionStart:
-    """Where a session begins.
+    """Where a session begins."""
 
-    Attributes:
-        env_steps: of the checkpoint, 0 without one.
-        wall_s: seconds of the run so far, those after the checkpoint included.
-        lost: env steps of all sessions that no checkpoint kept.
-    """
-
-    env_steps: int
-    wall_s: float
-    lost: int
+    env_steps: int  # of the checkpoint, 0 without one
+    wall_s: float  # s of the run so far, those after the checkpoint included
+    lost: int  # env steps of all sessions that no checkpoint kept
 
 
 def begin_session(
@@ -136,9 +130,6 @@ class StopSignals:
 
     A second Ctrl-C raises KeyboardInterrupt where it falls. A second SIGTERM does
     nothing: schedulers repeat it, and it must not cost the checkpoint being written.
-
-    Attributes:
-        requested: whether to stop.
 
     Example:
         >>> with StopSignals() as stop:

@@ -79,10 +79,7 @@ class RunningStats:
     ) -> None:
         """Count one vector step and the episodes that ended in it, (N, 1) bool.
 
-        Args:
-            done: ended.
-            terminated: failed.
-            causes: for what; (N, 2) bool each, by hand.
+        ``causes`` of the ends are (N, 2) bool each, by hand.
         """
         self._steps += 1
         causes = causes or {}

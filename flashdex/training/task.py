@@ -17,36 +17,33 @@ if TYPE_CHECKING:
 
 
 class Task(Protocol):
-    """A session calls the methods down to ``begin`` and ``close``, the loop the rest.
+    """A session calls all down to ``begin`` and ``close``, the loop the rest."""
 
-    Attributes:
-        worlds_key: recipe key of the number of worlds.
-        evaluated_keys: what a checkpoint must hold to be evaluated.
-        resumed_keys: what it must hold to be gone on from.
-        updates_during_step: an off-policy learner learns while the physics steps, on
-            the rows before that step; otherwise after it.
-        recipe: validated recipe.
-        env: the environment, from ``prepare`` on.
-        record_due: write a record after this step.
-        note: what was achieved, in a few words.
-        num_results: grows with what a record would tell besides env steps.
-        rows_meaning: what replay rows depend on; rows of another meaning are dropped.
-    """
-
-    worlds_key: ClassVar[str]
-    evaluated_keys: ClassVar[tuple[str, ...]]
-    resumed_keys: ClassVar[tuple[str, ...]]
+    worlds_key: ClassVar[str]  # recipe key of the number of worlds
+    evaluated_keys: ClassVar[tuple[str, ...]]  # of a checkpoint to be evaluated
+    resumed_keys: ClassVar[tuple[str, ...]]  # of one to be gone on from
+    state_keys: ClassVar[tuple[str, ...]]  # entries of a state that a learner reads
+    # An off-policy learner learns while the physics steps, on the rows before that
+    # step; otherwise after it.
     updates_during_step: ClassVar[bool]
     recipe: Any
-    env: Any
-    record_due: bool = False
+    env: Any  # from ``prepare`` on
+    record_due: bool = False  # write a record after this step
 
     @property
-    def note(self) -> str: ...  # noqa: D102
+    def note(self) -> str:
+        """What was achieved, in a few words."""
+        ...
+
     @property
-    def num_results(self) -> int: ...  # noqa: D102
+    def num_results(self) -> int:
+        """Grows with what a record would tell besides env steps."""
+        ...
+
     @property
-    def rows_meaning(self) -> str: ...  # noqa: D102
+    def rows_meaning(self) -> str:
+        """What replay rows depend on; rows of another meaning are dropped."""
+        ...
 
     @classmethod
     def open(cls, recipe: Any, run_dir: Path | None = None) -> Task:

@@ -50,6 +50,7 @@ class TrackingTask(Task):
 
     worlds_key = "env.num_envs"
     evaluated_keys, resumed_keys = EVALUATED, RESUMED
+    state_keys = (*keys.STATE, keys.ATTEMPT)
     updates_during_step = True
 
     def __init__(self, builder: RunBuilder) -> None:

@@ -164,7 +164,14 @@ class Trainer:
                 if lost is not None:
                     raise lost
         except NonFiniteError as error:
-            raise self._dump(str(error)) from error
+            raise stop_with_dump(
+                self.run_dir,
+                str(error),
+                recipe=self.recipe,
+                learner=self.learner,
+                env_steps=self.env_steps,
+                metrics=self._last_record,
+            ) from error
         except OSError as error:
             raise RunError(
                 f"{self.run_dir}: cannot be written ({error}). The run stopped; what "
@@ -204,7 +211,7 @@ class Trainer:
     def vector_step(self, td: TensorDictBase) -> TensorDictBase:
         """One step of all worlds, with the updates that belong to it."""
         with self.stats.time("act"):
-            action = self.learner.act(td.to(self.learner.device))
+            action = self.learner.act(self._state_of(td))
             self.env.put_action(td, action)
         # The updates read rows and write weights, the step does neither.
         with self.worker.run(self._update) if self.learns_beside else nullcontext():
@@ -229,16 +236,19 @@ class Trainer:
         self.task.after_reset()
         return td
 
+    def _state_of(self, td: TensorDictBase) -> TensorDictBase:
+        """What the learner reads of a state, on its device."""
+        return td.select(*self.task.state_keys).to(self.learner.device)
+
     def _process_step(self, td: TensorDictBase, action: Tensor) -> None:
-        device = self.learner.device
-        after = td.get("next").to(device)
+        device, after = self.learner.device, td.get("next")
         self.learner.process_step(
-            td.exclude("next").to(device),
+            self._state_of(td),
             action.to(device),
-            self.task.rewards(after),
-            after,
-            after[keys.TERMINATED],
-            after[keys.DONE],
+            self.task.rewards(after).to(device),
+            self._state_of(after),
+            after[keys.TERMINATED].to(device),
+            after[keys.DONE].to(device),
         )
 
     def _update(self) -> None:
@@ -278,16 +288,6 @@ class Trainer:
         self.log.write(record)
         self._last_log = time.monotonic()
         self._logged = (self.env_steps, self.task.num_results)
-
-    def _dump(self, what: str) -> RunError:
-        return stop_with_dump(
-            self.run_dir,
-            what,
-            recipe=self.recipe,
-            learner=self.learner,
-            env_steps=self.env_steps,
-            metrics=self._last_record,
-        )
 
     def _try_to_save(self) -> None:
         """Save; a disk that is full may have room again at the next time."""

@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.algorithms.flashsac import make_buffer
 from flashdex.errors import FlashdexError
-from flashdex.replay.buffer import HostBuffer, RowBuffer, RowStorage
+from flashdex.replay.buffer import RowBuffer, RowStorage
 from flashdex.replay.disk import ReplayLog
 
 CPU = torch.device("cpu")
@@ -40,7 +40,7 @@ def assert_whole(rows):
 
 def make_host(capacity=1000, **options):
     generator = torch.Generator().manual_seed(3)
-    return HostBuffer(capacity, generator=generator, **SIZES, **options)
+    return RowBuffer(capacity, generator=generator, on_host=True, **SIZES, **options)
 
 
 @pytest.mark.parametrize("stages", [0, 1, 3])
@@ -112,19 +112,20 @@ def test_without_threads_every_store_draws_the_same():
 
 
 @pytest.mark.parametrize(
-    ("replay", "prefetch", "kind", "shared"),
+    ("replay", "prefetch", "on_host", "shared"),
     [
-        ("auto", 2, RowBuffer, True),
-        ("device", 2, RowBuffer, True),
-        ("cpu", 2, HostBuffer, False),
-        ("cpu", 0, HostBuffer, True),
+        ("auto", 2, False, True),
+        ("device", 2, False, True),
+        ("cpu", 2, True, False),
+        ("cpu", 0, True, True),
     ],
 )
-def test_what_a_recipe_gets(replay, prefetch, kind, shared):
+def test_what_a_recipe_gets(replay, prefetch, on_host, shared):
     config = AlgoConfig(replay=replay, prefetch=prefetch)
     generator = torch.Generator()
     buffer = make_buffer(config, device=CPU, generator=generator, seed=7)
-    assert type(buffer) is kind
+    assert buffer.on_host == on_host
+    assert buffer.prefetch == (prefetch if on_host else 0)
     # threads must not draw from the generator of the noise
     assert (buffer.generator is generator) == shared
 

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from flashdex.algorithms.config import AlgoConfig
+from flashdex.algorithms.footprint import PeakMeter, tensor_bytes
 from flashdex.cli.memory_report import format_cards, format_plan
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
@@ -26,7 +27,6 @@ from flashdex.training.memory.plan import (
     plan_memory,
     round_down,
 )
-from flashdex.training.memory.rehearsal import PeakMeter, tensor_bytes
 from flashdex.training.memory.stand_in import Collection
 
 GB = 10**9
@@ -96,7 +96,7 @@ def test_replay_rows_are_exact(trained, rows):
 )
 def test_networks_are_exact(trained, algo):
     _, learner, plan = trained(algo=algo)
-    nets, stepper = plan.sizes.networks, learner.agent.stepper
+    nets, stepper = plan.sizes.learner.networks, learner.agent.stepper
     loss = learner.agent.loss
     everything = [p for _, p in nn.Module.named_parameters(loss)]
     own = [

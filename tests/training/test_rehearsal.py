@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from benchmarks.common.ceilings import count_products, total_flops
+from flashdex.algorithms.agent import make_actor, make_critic, walk_update
 from flashdex.algorithms.config import AlgoConfig
-from flashdex.algorithms.flashsac import make_actor, make_critic
+from flashdex.algorithms.footprint import Networks, PeakMeter
 from flashdex.objectives.batch import FlashBatch
 from flashdex.objectives.flashsac import FlashSACLoss
-from flashdex.training.memory.rehearsal import Networks, PeakMeter, flashsac_update
 
 FUTURE = (12, 10)
 SMALL = {"actor_width": 32, "critic_width": 48, "future_channels": [16, 16, 8]}
@@ -39,7 +39,7 @@ def make_batch(loss, size, device):
 
 
 def walk_flashsac(loss, batch, noise, **options):
-    return flashsac_update(loss, batch, noise, **options)[0]
+    return walk_update(loss, batch, noise, **options)[0]
 
 
 def test_meter_counts_storages_not_views():
@@ -120,7 +120,7 @@ def test_gradients_are_not_counted_twice():
 
 @pytest.mark.parametrize("period", [1, 2])
 def test_products_are_those_the_profiler_sees(period):
-    _, walked = flashsac_update(
+    _, walked = walk_update(
         make_loss("meta"),
         *make_batch(make_loss("meta"), 64, "meta"),
         actor_period=period,

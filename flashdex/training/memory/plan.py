@@ -17,6 +17,7 @@ from pathlib import Path
 import mujoco
 import torch
 
+from flashdex.algorithms import find_algorithm
 from flashdex.errors import FlashdexError
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
@@ -54,10 +55,7 @@ class Part:
 def list_parts(recipe: Recipe, sizes: Rehearsal, *, device: Pool) -> list[Part]:
     """Everything a run of the recipe allocates that is worth a line.
 
-    Args:
-        recipe: validated recipe.
-        sizes: of a recipe that differs in buffer, batch, worlds and replay only.
-        device: where the learner lives.
+    ``sizes`` are of a recipe that differs in buffer, batch, worlds and replay only.
     """
     frames, objects = sizes.bank_bytes
     counts = sizes.collection
@@ -92,17 +90,18 @@ def replay_pool(recipe: Recipe, device: Pool) -> Pool:
 
 def _learner(recipe: Recipe, sizes: Rehearsal, device: Pool) -> Iterator[Part]:
     algo, train, envs = recipe.algo, recipe.train, recipe.env.num_envs
-    nets, width = sizes.networks, sizes.row_bytes
+    nets, width = sizes.learner.networks, sizes.row_bytes
+    kind = find_algorithm(algo.kind)
+    rows, size = kind.row_count(algo, envs), kind.batch_rows(algo, envs)
     about = (
         f"weights {nets.weights / 1e6:,.0f}, gradients {nets.gradients / 1e6:,.0f}, "
         f"Adam {nets.moments / 1e6:,.0f} MB"
     )
     yield Part("networks", device, nets.total, about)
     if width:
-        rows, size = algo.buffer_size, algo.batch_size
         yield _product("replay rows", replay_pool(recipe, device), rows, width)
         ends = 2 * max(1, math.ceil(algo.updates_per_step)) * size + envs
-        each = sizes.input_bytes
+        each = sizes.learner.input_bytes
         yield _product("observations", device, ends, each, " while assembled")
         about = f"{algo.n_step} steps of {envs} worlds"
         tail = algo.n_step * envs * sizes.step_bytes
@@ -110,14 +109,12 @@ def _learner(recipe: Recipe, sizes: Rehearsal, device: Pool) -> Iterator[Part]:
         if train.checkpoint_replay:
             rows = min(rows, recipe.total_env_steps)
             yield _product("stored replay rows", "disk", rows, width)
-    else:
-        rows = envs * algo.ppo.horizon
-        size = -(-rows // algo.ppo.minibatches)
-        each = 2 * sizes.step_bytes + sizes.input_bytes  # collected and stacked
-        about = f" of {algo.ppo.horizon} steps, with their inputs"
+    elif rows:
+        each = 2 * sizes.step_bytes + sizes.learner.input_bytes  # collected and stacked
+        about = f" of {rows // envs} steps, with their inputs"
         yield _product("rollout", device, rows, each, about)
     about = f"batch and activations of {size:,} rows, walked"
-    yield Part("update", device, sizes.update(size)[0], about)
+    yield Part("update", device, sizes.learner.update(size)[0], about)
     one, kept = nets.weights + nets.moments, train.keep_checkpoints + 1
     about = f"{kept} x {one / 1e6:,.0f} MB, one of them being written"
     yield Part("checkpoints", "disk", kept * one, about)
@@ -167,21 +164,13 @@ def _cores() -> int:
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """Parts of a run, and what the machine has.
-
-    Attributes:
-        recipe: what is planned.
-        device: where the learner lives.
-        parts: all lines.
-        machine: free memory.
-        sizes: what the parts are products of.
-    """
+    """Parts of a run, and what the machine has."""
 
     recipe: Recipe
-    device: Pool
+    device: Pool  # where the learner lives
     parts: list[Part]
-    machine: Machine
-    sizes: Rehearsal = field(repr=False)
+    machine: Machine  # free memory
+    sizes: Rehearsal = field(repr=False)  # what the parts are products of
 
     def need(self, pool: Pool, *, certain: bool = False) -> int:
         """Bytes that a pool must give; ``certain`` leaves out what is assumed."""
@@ -247,15 +236,10 @@ def plan_memory(
     device: Pool | None = None,
     run_dir: Path | None = None,
 ) -> MemoryPlan:
-    """Compute what a run of a recipe will need.
+    """Compute what a run of a recipe will need, here and where the trainer will put it.
 
-    Args:
-        recipe: validated recipe.
-        library: its motions; None looks for the prepared ones and takes the worst case
-            where there are none.
-        machine: None looks at this one.
-        device: where the learner lives; None is where the trainer will put it.
-        run_dir: where checkpoints go; None is the current folder.
+    Without a library the prepared one is looked for, and the worst case taken where
+    there is none.
 
     Raises:
         MissingExtraError: the physics engine is not installed.
@@ -283,23 +267,24 @@ def overrides_that_fit(plan: MemoryPlan) -> list[str]:
     found.append(_change(plan))
     if plan.sizes.row_bytes and replay_pool(recipe, plan.device) == "gpu":
         found.append(_change(plan, algo__replay="pinned"))
-    envs, size = recipe.env.num_envs, recipe.algo.batch_size
-    for key, value in (("env__num_envs", envs), ("algo__batch_size", size)):
-        halves = ({key: value >> i} for i in range(1, value.bit_length() - 1))
-        found.append(_first(plan, halves, fewer_rows=False))
+    wanted = {
+        "env__num_envs": recipe.env.num_envs,
+        "algo__batch_size": recipe.algo.batch_size,
+    }
+    for key, value in wanted.items():
+        found.append(_halved(plan, {key: value}, fewer_rows=False))
     if not any(found):
-        steps = range(1, min(envs, size).bit_length() - 1)
-        both = (
-            {"env__num_envs": envs >> i, "algo__batch_size": size >> i} for i in steps
-        )
-        found.append(_first(plan, both, fewer_rows=True))
+        found.append(_halved(plan, wanted, fewer_rows=True))
     return [words for words in found if words]
 
 
-def _first(
-    plan: MemoryPlan, options: Iterator[dict[str, int]], *, fewer_rows: bool
-) -> str:
-    tried = (_change(plan, fewer_rows=fewer_rows, **values) for values in options)
+def _halved(plan: MemoryPlan, wanted: dict[str, int], *, fewer_rows: bool) -> str:
+    """The largest halves that fit, in words, else empty; at least 2 remain."""
+    steps = range(1, min(wanted.values()).bit_length() - 1)
+    tried = (
+        _change(plan, fewer_rows=fewer_rows, **{k: v >> i for k, v in wanted.items()})
+        for i in steps
+    )
     return next((words for words in tried if words), "")
 
 

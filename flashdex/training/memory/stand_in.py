@@ -149,11 +149,9 @@ class StandIn(MotionLibrary):
 
     @staticmethod
     def scale(buffers: list[Tensor], sizes: Collection) -> tuple[int, int]:
-        """Bytes that tensors of the stand-in have in the collection: frames, objects.
+        """Bytes in the collection of tensors of the stand-in: frames, and objects.
 
-        Args:
-            buffers: each with a row a frame, a motion or an object.
-            sizes: of the collection.
+        Each has a row a frame, a motion or an object.
         """
         counts = {_FRAMES: sizes.frames, _MOTIONS: sizes.motions}
         counts[_OBJECTS] = sizes.objects

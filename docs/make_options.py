@@ -72,7 +72,7 @@ def allowed(field: dataclasses.Field[Any], hint: Any) -> str:
     names = {int: "integer", float: "number", bool: "true or false", str: "text"}
     bounds = [
         f"{sign} {field.metadata[key]:g}"
-        for key, sign in (("above", "&gt;"), ("low", "&ge;"), ("high", "&le;"))
+        for key, sign in (("gt", "&gt;"), ("ge", "&ge;"), ("le", "&le;"))
         if field.metadata.get(key) is not None
     ]
     return " ".join([names.get(hint, str(hint)), " and ".join(bounds)]).strip()

@@ -216,6 +216,11 @@ class Kind:
     make_base: Callable[[], dict[str, Any]]
     """What its files are merged onto: all named parts with no option set."""
 
+    @property
+    def keys(self) -> set[str]:
+        """Those at the top of its recipes."""
+        return {field.name for field in dataclasses.fields(self.root)}
+
 
 DEFAULT_TASK = "retarget"
 KINDS: dict[str, Kind] = {
@@ -254,9 +259,9 @@ def split_foreign(
         )
         kept.pop("task")
         task = DEFAULT_TASK
-    own = _keys(KINDS[task])
+    own = KINDS[task].keys
     for key in data:
-        homes = [name for name, kind in KINDS.items() if key in _keys(kind)]
+        homes = [name for name, kind in KINDS.items() if key in kind.keys]
         if key not in own and homes:
             problems.append(
                 f"{key}: belongs to recipes with task: {homes[0]}, this one has "
@@ -273,12 +278,8 @@ def mark_groups(data: Mapping[str, Any], groups: Iterable[str]) -> dict[str, Any
         data: the composed recipe.
         groups: those it chose an option of.
     """
-    own = _keys(kind_of(data))
+    own = kind_of(data).keys
     return {**{group: None for group in groups if group not in own}, **data}
-
-
-def _keys(kind: Kind) -> set[str]:
-    return {field.name for field in dataclasses.fields(kind.root)}
 
 
 def expect_kind(recipe: RunRecipe, root: type[R], *, where: str) -> R:

@@ -102,6 +102,12 @@ def test_five_mistakes_are_reported_at_once(write_recipe):
         ("env.num_envs=0", "env.num_envs: 0 must be at least 1"),
         ("env.num_envs=true", "env.num_envs: expected an integer"),
         ("env.num_envs=1.5", "env.num_envs: expected an integer"),
+        ("env.max_seconds=nan", "env.max_seconds: expected a finite number, found nan"),
+        ("train.wall_limit_s=inf", "wall_limit_s: expected a finite number, found inf"),
+        ("env.max_seconds='5'", "env.max_seconds: expected a number, found '5'"),
+        ("env.rsi=1", "env.rsi: expected true or false, found 1"),
+        ("logger.kind=[csv,wndb]", "logger.kind: item 1: 'wndb' is not allowed. Did"),
+        ("expect=[{metric: a}]", "expect[0].at_env_steps: missing; every recipe must"),
         ("hand=xhnad", "Did you mean 'xhand'?"),
         ("physics.engine=gpu", "physics.engine: 'gpu' is not allowed"),
         ("~env.transforms.contacts", "Did you mean 'contact'?"),
@@ -121,6 +127,21 @@ def test_five_mistakes_are_reported_at_once(write_recipe):
 )
 def test_a_wrong_override_names_its_place(override, expected):
     assert expected in "\n".join(problems_of("quickstart", [override]))
+
+
+def test_wrong_values_and_what_does_not_fit_together_are_one_report():
+    found = problems_of(
+        "quickstart",
+        [
+            "total_env_steps=many",
+            "physics.decimation=2",
+            "env.num_envs=1e99",
+            "seed=3e0",
+        ],
+    )
+    assert found[0] == "total_env_steps: expected an integer, found 'many'"
+    assert any(p.startswith("physics.timestep: 2 substeps of") for p in found)
+    assert not any(p.startswith("seed") for p in found)
 
 
 def test_deleting_a_transform_keeps_the_order_of_the_others():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -197,6 +199,21 @@ def test_unknown_recipe_lists_the_known_ones():
         compose("quickstrat")
     with pytest.raises(FlashdexError, match="no such file"):
         compose("nowhere/quickstart.yaml")
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import flashdex.recipe.store",
+        "import flashdex.reports.run.terminal",
+        "from flashdex.cli.main import main; assert main(['ls']) == 0",
+        "from flashdex.cli.main import main; assert main(['report', 'nowhere']) == 2",
+    ],
+)
+def test_verbs_that_only_read_start_without_torch(code):
+    heavy = "{'torch', 'mujoco', 'torchrl', 'pydantic'}"
+    code = f"import sys; {code}; assert not {heavy} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=RECIPES.parent)
 
 
 def test_local_recipes_come_before_the_packaged_ones(tmp_path, monkeypatch):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from flashdex.errors import DemoError
+
+if TYPE_CHECKING:
+    import mujoco
 
 NUM_JOINTS = 29
 # keypoint order: wrist, then thumb to pinky from the palm outwards; "site:" = a tip
@@ -42,6 +45,8 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
     Returns:
         m, world, (T, 21, 3).
     """
+    import mujoco  # here: sources are listed without it
+
     model, owners = _model(tree)
     data = mujoco.MjData(model)
     points = np.full((len(joint_pos), len(ELEMENTS), 3), np.nan)
@@ -57,6 +62,8 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _model(tree: Path) -> tuple[mujoco.MjModel, tuple[tuple[bool, int], ...]]:
+    import mujoco
+
     text = _read(tree)
     try:
         root = ET.fromstring(text)

@@ -19,8 +19,8 @@ from flashdex.recipe.schema import Expectation, RunRecipe
 PAGE = Path(__file__).parent / "options.md"
 HEAD = """# Every option
 
-Made by `python docs/make_options.py` from the config dataclasses and the registered terms,
-which are the one place of defaults; a test fails when this page is not up to date. How a
+Made by `python docs/make_options.py` from the config dataclasses and the registered
+terms, the one place of defaults; a test fails when this page is not up to date. How a
 recipe is put together stands on the page [recipes](recipes.md).
 
 Metres, radians, seconds, kilograms, unless a unit is given.
@@ -72,7 +72,7 @@ def allowed(field: dataclasses.Field[Any], hint: Any) -> str:
     names = {int: "integer", float: "number", bool: "true or false", str: "text"}
     bounds = [
         f"{sign} {field.metadata[key]:g}"
-        for key, sign in (("above", "&gt;"), ("low", "&ge;"), ("high", "&le;"))
+        for key, sign in (("gt", "&gt;"), ("ge", "&ge;"), ("le", "&le;"))
         if field.metadata.get(key) is not None
     ]
     return " ".join([names.get(hint, str(hint)), " and ".join(bounds)]).strip()

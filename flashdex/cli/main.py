@@ -185,7 +185,7 @@ def _cp(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from flashdex.recipe.compose import validate_paths
+    from flashdex.recipe.merge import validate_paths
 
     for path in validate_paths(args.paths):
         print(f"ok  {path}")

@@ -18,7 +18,6 @@ import zipfile
 from pathlib import Path
 
 from flashdex.errors import DemoError, UnknownNameError
-from flashdex.objects.asset import default_cache_dir
 
 WHEEL = "myosuite==2.12.2"
 WHEEL_SHA256 = "bec0133d9d4ba0249aeccdd7de632eead4749436ffb4e5a3c44a8f9cedafd9ea"
@@ -45,6 +44,8 @@ class UnknownDatasetError(UnknownNameError):
 
 def myodm_dir() -> Path:
     """Where ``fetch myodm`` puts the recordings by default."""
+    from flashdex.objects.asset import default_cache_dir  # needs torch, listing not
+
     return default_cache_dir() / "data" / "myodm"
 
 

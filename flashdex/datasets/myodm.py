@@ -13,8 +13,8 @@ import xml.etree.ElementTree as ET
 from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
@@ -23,6 +23,9 @@ from flashdex.datasets.fields import require
 from flashdex.datasets.files import load_npz, read_json
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
+
+if TYPE_CHECKING:
+    import mujoco
 
 NUM_JOINTS = 29
 # keypoint order: wrist, then thumb to pinky from the palm outwards; "site:" = a tip
@@ -51,6 +54,8 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
     Of the tree ``myohand_body.xml`` at joint positions (T, 29), m and rad: six of the
     root, then the hand's.
     """
+    import mujoco  # here: sources are listed without it
+
     model, owners = _model(tree)
     data = mujoco.MjData(model)
     points = np.full((len(joint_pos), len(ELEMENTS), 3), np.nan)
@@ -66,6 +71,8 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _model(tree: Path) -> tuple[mujoco.MjModel, tuple[tuple[bool, int], ...]]:
+    import mujoco
+
     text = _read(tree)
     try:
         root = ET.fromstring(text)

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
 from flashdex.errors import MeshError
-from flashdex.geometry.points import farthest_point_sampling
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
 MIN_PART_AREA = 0.01  # share of the area below which a loose component is dropped
@@ -185,6 +183,10 @@ def sample_surface_points(
     Returns:
         Points, m, object frame, (P, 3), and unit normals of their triangles, (P, 3).
     """
+    import torch  # here: meshes are read, and sources listed, without it
+
+    from flashdex.geometry.points import farthest_point_sampling
+
     number = SAMPLES_PER_POINT * count
     dense, face, *_ = trimesh.sample.sample_surface(mesh, number, seed=seed)
     dense = np.asarray(dense)

@@ -1,29 +1,43 @@
 """A plain mapping against the schema: the recipe, and everything wrong with it.
 
-Nothing raises at the first mistake: a value that cannot be used is noted and its
-default stands in, so that the rest is still checked.
+pydantic reads the dataclasses. Nothing raises at the first mistake: a value that cannot
+be used is noted and its default stands in, so that the rest is still checked.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import types
+import functools
+import json
+import operator
+import re
 import typing
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from types import GenericAlias
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from flashdex.algorithms.base import config_class
-from flashdex.algorithms.config import AlgoConfig
-from flashdex.envs.mdp.term import KINDS, Kind, find_term, registry
+from flashdex.envs.config import EnvConfig
+from flashdex.envs.mdp.term import KINDS, Kind, default_mapping, find_term, registry
 from flashdex.errors import FlashdexError, RecipeError, nearest
 from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.tasks import split_foreign
-from flashdex.system.fields import range_problem
 
 R = TypeVar("R", bound=RunRecipe)
-_NAMED: dict[str, Kind] = {f"env.{kind}": kind for kind in KINDS}
 # Stand-ins for required values that are absent; the recipe is refused anyway.
 _STAND_INS: dict[type, Any] = {int: 1, str: "", float: 1.0}
+_EXPECTED = {
+    "int_type": "an integer",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "list_type": "a list",
+    "dataclass_type": "keys and values",
+}
+_RANGES = {"gt": "greater than", "ge": "at least", "le": "at most"}
 
 
 def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
@@ -39,7 +53,13 @@ def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
     """
     problems: list[str] = []
     kind, own = split_foreign(data, problems)
-    recipe = _read_dataclass(kind.root, own, "", problems)
+    algo, env = own.pop("algo", {}), own.pop("env", {})
+    recipe: Any = _build(kind.root, own, "", problems)
+    if "env" in kind.keys:
+        recipe = dataclasses.replace(recipe, env=_read_env(env, problems))
+    # An algorithm may add keys.
+    cls = config_class(algo.get("kind") if isinstance(algo, Mapping) else None)
+    recipe = dataclasses.replace(recipe, algo=_build(cls, algo, "algo", problems))
     return recipe, problems + kind.find_conflicts(recipe)
 
 
@@ -55,145 +75,135 @@ def validate(recipe: R) -> R:
     return typing.cast(R, complete)
 
 
-def _join(path: str, key: object) -> str:
-    return f"{path}.{key}" if path else str(key)
-
-
-def _unknown(path: str, what: str, name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    allowed = ", ".join(known) if known else "none"
-    return f"{path}: unknown {what}.{nearest(name, known)} Allowed: {allowed}."
-
-
-def _read_dataclass(cls: type, data: Any, path: str, problems: list[str]) -> Any:
-    """Build one dataclass of the schema from a mapping."""
+def _read_env(data: Any, problems: list[str]) -> EnvConfig:
+    """Read the environment, whose terms are registered by name."""
     if not isinstance(data, Mapping):
-        problems.append(f"{path}: expected keys and values, found {data!r}")
-        data = {}
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    hints = typing.get_type_hints(cls)
-    what = "argument" if any(path.startswith(f"{n}.") for n in _NAMED) else "key"
-    for key in data:
-        where = _join(path, key)
-        if key == "_target_":
-            problems.append(f"{where}: recipes name registered parts, never classes")
-        elif key not in fields:
-            problems.append(_unknown(where, what, str(key), fields))
-    values = {
-        name: _read_field(field, hints[name], data, _join(path, name), problems)
-        for name, field in fields.items()
-    }
-    return cls(**values)
+        return _build(EnvConfig, data, "env", problems)
+    plain = {key: value for key, value in data.items() if key not in KINDS}
+    terms = {kind: _read_terms(kind, data, problems) for kind in KINDS}
+    env = _build(EnvConfig, plain, "env", problems)
+    return dataclasses.replace(env, **terms)
 
 
-def _read_field(
-    field: dataclasses.Field[Any],
-    hint: Any,
-    data: Mapping[str, Any],
-    path: str,
-    problems: list[str],
-) -> Any:
-    """Read one field: its value, or its default when absent or wrong."""
-    if field.default is not dataclasses.MISSING:
-        default = field.default
-    elif field.default_factory is not dataclasses.MISSING:
-        default = field.default_factory()
-    else:
-        default = _STAND_INS[hint]
-        if field.name not in data:
-            problems.append(f"{path}: missing; every recipe must give it")
-            return default
-    if path in _NAMED:
-        return _read_named(_NAMED[path], data.get(field.name, default), path, problems)
-    if field.name not in data:
-        return default
-    value, problem = _convert(hint, data[field.name], path, problems)
-    if problem is None and isinstance(value, int | float):
-        problem = range_problem(field, value)
-    if problem is not None:
-        problems.append(f"{path}: {problem}")
-        return default
-    return value
-
-
-def _read_named(
-    kind: Kind, data: Any, path: str, problems: list[str]
+def _read_terms(
+    kind: Kind, env: Mapping[str, Any], problems: list[str]
 ) -> dict[str, Any]:
-    """Read a named mapping of parts; the options of each are filled in."""
+    """Read the terms of a kind; the options of each are filled in."""
+    data = env.get(kind, default_mapping(kind))
     if not isinstance(data, Mapping):
-        problems.append(f"{path}: expected names and options, found {data!r}")
+        problems.append(f"env.{kind}: expected names and options, found {data!r}")
         return {}
     known = registry(kind)
     result: dict[str, Any] = {}
     for name, options in data.items():
-        where, target = _join(path, name), {}
+        where, target = f"env.{kind}.{name}", {}
         is_shipped = name in known and known[name].is_shipped
         if isinstance(options, Mapping) and not is_shipped:
             target = {k: v for k, v in options.items() if k == "_target_"}
             options = {k: v for k, v in options.items() if k != "_target_"}
         if name not in known and not target:
-            problems.append(_unknown(where, kind[:-1], str(name), known))
+            problems.append(f"{where}: {_unknown(kind[:-1], str(name), known)}")
             continue
         try:
             term = find_term(kind, name, target)
         except FlashdexError as error:
             problems.append(f"{where}: unknown {kind[:-1]}. {error}")
             continue
-        result[name] = None
+        result[name] = options
         if options is not None:
-            part = _read_dataclass(term.options, options, where, problems)
+            part = _build(term.options, options, where, problems)
             result[name] = target | dataclasses.asdict(part)
     return result
 
 
-def _convert(
-    hint: Any, value: Any, path: str, problems: list[str]
-) -> tuple[Any, str | None]:
-    """Return the value as the type wants it, or say why that is impossible."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        if value is None:
-            return None, None
-        inner = next(arg for arg in args if arg is not type(None))
-        return _convert(inner, value, path, problems)
-    if origin is Literal:
-        if value in args:
-            return value, None
-        close = nearest(str(value), [str(arg) for arg in args])
-        allowed = ", ".join(map(str, args))
-        return None, f"{value!r} is not allowed.{close} Allowed: {allowed}."
-    if origin is list:
-        return _convert_list(args[0], value, path, problems)
-    if dataclasses.is_dataclass(hint):
-        cls = typing.cast(type, hint)
-        if cls is AlgoConfig and isinstance(value, Mapping):
-            cls = config_class(value.get("kind"))  # an algorithm may add keys
-        return _read_dataclass(cls, value, path, problems), None
-    return _convert_scalar(hint, value)
+def _unknown(what: str, name: str, known: Iterable[str]) -> str:
+    allowed = ", ".join(known) or "none"
+    return f"unknown {what}.{nearest(name, known)} Allowed: {allowed}."
 
 
-def _convert_list(
-    hint: Any, value: Any, path: str, problems: list[str]
-) -> tuple[Any, str | None]:
-    if not isinstance(value, list | tuple):
-        return None, f"expected a list, found {value!r}"
-    items = []
-    for i, entry in enumerate(value):
-        item, problem = _convert(hint, entry, f"{path}[{i}]", problems)
-        if problem is not None:
-            return None, f"item {i}: {problem}"
-        items.append(item)
-    return items, None
+@functools.cache
+def _adapter(cls: type) -> TypeAdapter[Any]:
+    # In a tuple, as pydantic takes no configuration of a bare dataclass.
+    config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    alone: Any = GenericAlias(tuple, (cls,))
+    return TypeAdapter(alone, config=config)
 
 
-def _convert_scalar(hint: type, value: Any) -> tuple[Any, str | None]:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is float and is_number:
-        return float(value), None
-    # 3e8 is a float in YAML; a whole one is meant as an integer.
-    if hint is int and is_number and float(value).is_integer():
-        return int(value), None
-    if hint in (bool, str) and isinstance(value, hint):
-        return value, None
-    names = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
-    return None, f"expected {names[hint]}, found {value!r}"
+def _whole(text: str) -> float:
+    """A number of JSON: 3e8 is a float in YAML, but is meant as an integer."""
+    value = float(text)
+    return int(value) if value.is_integer() else value
+
+
+def _build(cls: type, data: Any, path: str, problems: list[str]) -> Any:
+    """Build a dataclass; what is wrong is noted and taken out, the rest read again."""
+    text = json.dumps([data], default=lambda value: {type(value).__name__: repr(value)})
+    root, noted = json.loads(text, parse_float=_whole), set()
+    for _ in range(6):  # absent values and their stand-ins show in later rounds
+        try:
+            # Strict, or "1" were a number; in JSON a mapping still is a dataclass.
+            return _adapter(cls).validate_json(json.dumps(root), strict=True)[0]
+        except ValidationError as found:
+            for error in found.errors():
+                where, problem = _explain(cls, error, path)
+                if where not in noted:
+                    problems.append(f"{where}: {problem}")
+                noted.add(where)
+                _replace(cls, root, error)
+    raise RecipeError(problems)  # a required value has no stand-in
+
+
+def _explain(cls: type, error: Any, path: str) -> tuple[str, str]:
+    """Where a mistake is and what it is, in the words of recipes."""
+    (_, *way), kind, value = error["loc"], error["type"], error["input"]
+    item = f"item {way.pop()}: " if _is_item(error) else ""
+    words = [f"[{key}]" if isinstance(key, int) else f".{key}" for key in way]
+    where = f"{path}{''.join(words)}".removeprefix(".")
+    limits = error.get("ctx", {})
+    if kind == "missing":
+        return where, "missing; every recipe must give it"
+    if kind == "unexpected_keyword_argument" and way[-1] == "_target_":
+        return where, "recipes name registered parts, never classes"
+    if kind == "unexpected_keyword_argument":
+        known = [field.name for field in dataclasses.fields(_owner(cls, way[:-1]))]
+        what = "argument" if path.startswith("env.") else "key"
+        return where, _unknown(what, way[-1], known)
+    if kind == "literal_error":
+        known = re.findall(r"'([^']*)'", limits["expected"])
+        problem = f"{value!r} is not allowed.{nearest(str(value), known)} "
+        return where, f"{item}{problem}Allowed: {', '.join(known)}."
+    for key in _RANGES.keys() & limits:
+        value, limit = type(limits[key])(value), f"{limits[key]:.12g}"
+        return where, f"{value} must be {_RANGES[key]} {limit}"
+    expected = _EXPECTED.get(kind, error["msg"])
+    return where, f"{item}expected {expected}, found {value!r}"
+
+
+def _is_item(error: Any) -> bool:
+    """Whether it is a plain item of a list, which is then refused as a whole."""
+    return isinstance(error["loc"][-1], int) and error["type"] != "dataclass_type"
+
+
+def _replace(cls: type, root: list[Any], error: Any) -> None:
+    """Put a stand-in where something is missing, and take out what is wrong."""
+    *way, key = error["loc"]
+    if _is_item(error):
+        *way, key = way
+    place: Any = functools.reduce(operator.getitem, way, root)
+    if error["type"] == "missing":
+        place[key] = _STAND_INS.get(get_type_hints(_owner(cls, way[1:]))[key])
+    elif error["type"] == "dataclass_type":
+        place[key] = {}
+    else:
+        place.pop(key, None)
+
+
+def _owner(cls: Any, way: list[int | str]) -> Any:
+    """The dataclass that is found along some keys."""
+    for key in way:
+        if isinstance(key, str):
+            hint = get_type_hints(cls)[key]
+            cls = next(
+                o for o in (hint, *get_args(hint)) if dataclasses.is_dataclass(o)
+            )
+    return cls

@@ -1,4 +1,7 @@
-"""Where recipes lie: a path, ./recipes, the recipes inside the package."""
+"""Where recipes lie: a path, ./recipes, the recipes inside the package; what a run is.
+
+Nothing here imports the schema, which would import torch.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,8 @@ import yaml
 
 import flashdex
 from flashdex.errors import FlashdexError, UnknownRecipeError
+
+DEFAULT_TASK, GYM_TASK = "retarget", "gym"
 
 
 @dataclass(frozen=True)
@@ -128,3 +133,26 @@ def copy_recipe(name_or_path: str | Path, destination: str | Path) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     return target
+
+
+def task_of_run(run_dir: Path) -> str:
+    """Return the task of a run directory; the default where none is stated."""
+    try:
+        data = yaml.safe_load((run_dir / "recipe.yaml").read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError):
+        return DEFAULT_TASK  # the verb itself says what is wrong with the folder
+    task = data.get("task") if isinstance(data, dict) else None
+    return GYM_TASK if task == GYM_TASK else DEFAULT_TASK
+
+
+def require_motions(run_dir: Path) -> None:
+    """Refuse a run that has none.
+
+    Raises:
+        FlashdexError: it trains on a stock environment.
+    """
+    if task_of_run(run_dir) == GYM_TASK:
+        raise FlashdexError(
+            f"{run_dir}: a run with task: gym has no motions. Its figures are in "
+            "metrics.jsonl; `flashdex evaluate` makes new ones."
+        )

@@ -5,10 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeVar
-
-import yaml
 
 from flashdex.algorithms import find_algorithm, known_algorithms
 from flashdex.algorithms.config import AlgoConfig
@@ -19,6 +16,7 @@ from flashdex.errors import FlashdexError, nearest
 from flashdex.hands.spec import known_hands
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
+from flashdex.recipe.store import DEFAULT_TASK, GYM_TASK
 
 
 def find_conflicts(recipe: Recipe) -> list[str]:
@@ -216,15 +214,19 @@ class Kind:
     make_base: Callable[[], dict[str, Any]]
     """What its files are merged onto: all named parts with no option set."""
 
+    @property
+    def keys(self) -> set[str]:
+        """Those at the top of its recipes."""
+        return {field.name for field in dataclasses.fields(self.root)}
 
-DEFAULT_TASK = "retarget"
+
 KINDS: dict[str, Kind] = {
     DEFAULT_TASK: Kind(
         root=Recipe,
         find_conflicts=find_conflicts,
         make_base=lambda: {"env": {k: default_mapping(k) for k in TERM_KINDS}},
     ),
-    "gym": Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, make_base=dict),
+    GYM_TASK: Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, make_base=dict),
 }
 
 
@@ -254,9 +256,9 @@ def split_foreign(
         )
         kept.pop("task")
         task = DEFAULT_TASK
-    own = _keys(KINDS[task])
+    own = KINDS[task].keys
     for key in data:
-        homes = [name for name, kind in KINDS.items() if key in _keys(kind)]
+        homes = [name for name, kind in KINDS.items() if key in kind.keys]
         if key not in own and homes:
             problems.append(
                 f"{key}: belongs to recipes with task: {homes[0]}, this one has "
@@ -273,12 +275,8 @@ def mark_groups(data: Mapping[str, Any], groups: Iterable[str]) -> dict[str, Any
         data: the composed recipe.
         groups: those it chose an option of.
     """
-    own = _keys(kind_of(data))
+    own = kind_of(data).keys
     return {**{group: None for group in groups if group not in own}, **data}
-
-
-def _keys(kind: Kind) -> set[str]:
-    return {field.name for field in dataclasses.fields(kind.root)}
 
 
 def expect_kind(recipe: RunRecipe, root: type[R], *, where: str) -> R:
@@ -299,26 +297,3 @@ def expect_kind(recipe: RunRecipe, root: type[R], *, where: str) -> R:
         f"{where}: needs a recipe with task: {wanted}; '{recipe.name}' is of another "
         "kind. `flashdex ls` says what each recipe trains."
     )
-
-
-def task_of_run(run_dir: Path) -> str:
-    """Return the task of a run directory; the default where none is stated."""
-    try:
-        data = yaml.safe_load((run_dir / "recipe.yaml").read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
-        return DEFAULT_TASK  # the verb itself says what is wrong with the folder
-    task = data.get("task") if isinstance(data, dict) else None
-    return task if task in KINDS else DEFAULT_TASK
-
-
-def require_motions(run_dir: Path) -> None:
-    """Refuse a run that has none.
-
-    Raises:
-        FlashdexError: it trains on a stock environment.
-    """
-    if task_of_run(run_dir) == "gym":
-        raise FlashdexError(
-            f"{run_dir}: a run with task: gym has no motions. Its figures are in "
-            "metrics.jsonl; `flashdex evaluate` makes new ones."
-        )

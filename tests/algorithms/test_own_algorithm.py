@@ -14,7 +14,7 @@ from flashdex.algorithms.base import ALGORITHMS, Learner, register, snapshot
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.errors import RecipeError, RunError
 from flashdex.recipe import compose
-from flashdex.recipe.compose import load_recipe
+from flashdex.recipe.merge import load_recipe
 from flashdex.system.fields import number
 from flashdex.system.jsonl import read_lines
 from flashdex.training.checkpoint import load_checkpoint

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -102,6 +104,12 @@ def test_five_mistakes_are_reported_at_once(write_recipe):
         ("env.num_envs=0", "env.num_envs: 0 must be at least 1"),
         ("env.num_envs=true", "env.num_envs: expected an integer"),
         ("env.num_envs=1.5", "env.num_envs: expected an integer"),
+        ("env.max_seconds=nan", "env.max_seconds: expected a finite number, found nan"),
+        ("train.wall_limit_s=inf", "wall_limit_s: expected a finite number, found inf"),
+        ("env.max_seconds='5'", "env.max_seconds: expected a number, found '5'"),
+        ("env.rsi=1", "env.rsi: expected true or false, found 1"),
+        ("logger.kind=[csv,wndb]", "logger.kind: item 1: 'wndb' is not allowed. Did"),
+        ("expect=[{metric: a}]", "expect[0].at_env_steps: missing; every recipe must"),
         ("hand=xhnad", "Did you mean 'xhand'?"),
         ("physics.engine=gpu", "physics.engine: 'gpu' is not allowed"),
         ("~env.transforms.contacts", "Did you mean 'contact'?"),
@@ -121,6 +129,21 @@ def test_five_mistakes_are_reported_at_once(write_recipe):
 )
 def test_a_wrong_override_names_its_place(override, expected):
     assert expected in "\n".join(problems_of("quickstart", [override]))
+
+
+def test_wrong_values_and_what_does_not_fit_together_are_one_report():
+    found = problems_of(
+        "quickstart",
+        [
+            "total_env_steps=many",
+            "physics.decimation=2",
+            "env.num_envs=1e99",
+            "seed=3e0",
+        ],
+    )
+    assert found[0] == "total_env_steps: expected an integer, found 'many'"
+    assert any(p.startswith("physics.timestep: 2 substeps of") for p in found)
+    assert not any(p.startswith("seed") for p in found)
 
 
 def test_deleting_a_transform_keeps_the_order_of_the_others():
@@ -176,6 +199,21 @@ def test_unknown_recipe_lists_the_known_ones():
         compose("quickstrat")
     with pytest.raises(FlashdexError, match="no such file"):
         compose("nowhere/quickstart.yaml")
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import flashdex.recipe.store",
+        "import flashdex.reports.run.terminal",
+        "from flashdex.cli.main import main; assert main(['ls']) == 0",
+        "from flashdex.cli.main import main; assert main(['report', 'nowhere']) == 2",
+    ],
+)
+def test_verbs_that_only_read_start_without_torch(code):
+    heavy = "{'torch', 'mujoco', 'torchrl', 'pydantic'}"
+    code = f"import sys; {code}; assert not {heavy} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=RECIPES.parent)
 
 
 def test_local_recipes_come_before_the_packaged_ones(tmp_path, monkeypatch):

@@ -14,6 +14,8 @@ import numpy as np
 import flashdex
 from flashdex.rollouts.certificate import certify
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 run = flashdex.load_run(sys.argv[1])
 print(f"{run.recipe.name}: {len(run.attempts)} attempts, {len(run.converted)} stored")
 motion = sys.argv[2] if len(sys.argv) > 2 else next(iter(run.converted))

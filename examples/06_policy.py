@@ -8,6 +8,8 @@ import sys
 import flashdex
 from flashdex.recipe import override_recipe
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 run = flashdex.load_run(sys.argv[1])
 recipe = override_recipe(run.recipe, sys.argv[2:])
 env = flashdex.make_env(recipe, num_envs=4, seed=0, evaluation=True)

@@ -247,8 +247,8 @@ class FlashSACLearner(Learner):
             )
         if config.min_buffer >= budget > 1:
             problems.append(
-                f"algo.min_buffer: {config.min_buffer} rows of random actions use up "
-                f"total_env_steps={budget}"
+                f"algo.min_buffer: {config.min_buffer} rows collected before learning "
+                f"use up total_env_steps={budget}; give fewer rows or more steps"
             )
         # The newest n steps of every world have no complete return yet.
         ((key, num_envs),) = worlds.items()

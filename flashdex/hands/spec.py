@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+import flashdex.hands
 from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
 from flashdex.keys import FINGERS, SIDES, Side
@@ -98,8 +99,9 @@ class HandSpec:
 
 
 def known_hands() -> list[str]:
-    """Names of the built-in hands: the folders beside this file that hold models."""
-    return sorted(f.parent.name for f in Path(__file__).parent.glob("*/left.xml"))
+    """Names of the hands: folders of the package that hold models."""
+    models = (Path(root).glob("*/left.xml") for root in flashdex.hands.__path__)
+    return sorted({model.parent.name for found in models for model in found})
 
 
 def load_hand(name: str) -> dict[Side, HandSpec]:

@@ -12,6 +12,12 @@ from flashdex.objectives.flashsac import FlashSACLoss
 OBS, ACT, CHANNELS = 5, 2, 4
 
 
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Weights and noise do not depend on which tests ran before."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture
 def make_loss():
     def make(

@@ -65,3 +65,13 @@ def make_env(make_physics, bank, hands):
         )
 
     return make
+
+
+@pytest.fixture
+def forget_terms(monkeypatch):
+    """Terms that a test registers, and packages that it allows, are gone after it."""
+    from flashdex.envs.mdp import term
+
+    term.registry("rewards")  # those that ship are there before
+    monkeypatch.setattr(term, "_TERMS", {k: dict(v) for k, v in term._TERMS.items()})
+    monkeypatch.setattr(term, "_ALLOWED", set(term._ALLOWED))

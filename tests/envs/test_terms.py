@@ -16,9 +16,9 @@ from torchrl.envs.utils import check_env_specs
 
 from flashdex import keys
 from flashdex.envs.config import EnvConfig
-from flashdex.envs.mdp import allow, number, reward, term
+from flashdex.envs.mdp import allow, number, reward
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.mdp.term import default_mapping, find_term, registry
+from flashdex.envs.mdp.term import default_mapping, find_term
 from flashdex.envs.transforms.assembly import ConcatBlocks, assemble, make_transforms
 from flashdex.envs.transforms.base import Block, BlockContext
 from flashdex.errors import FlashdexError, RecipeError, UnknownNameError
@@ -32,12 +32,7 @@ OWN = {
 }
 
 
-@pytest.fixture(autouse=True)
-def forget(monkeypatch):
-    """What a test registers and allows is gone after it."""
-    registry("rewards")
-    monkeypatch.setattr(term, "_TERMS", {k: dict(v) for k, v in term._TERMS.items()})
-    monkeypatch.setattr(term, "_ALLOWED", set(term._ALLOWED))
+pytestmark = pytest.mark.usefixtures("forget_terms")
 
 
 @pytest.fixture

@@ -20,13 +20,7 @@ SAID = {
 NEEDS_RUN = ("04_rollout", "06_policy")
 
 
-@pytest.fixture(autouse=True)
-def forget_terms(monkeypatch):
-    """What an example registers is gone after it."""
-    from flashdex.envs.mdp import term
-
-    term.registry("rewards")
-    monkeypatch.setattr(term, "_TERMS", {k: dict(v) for k, v in term._TERMS.items()})
+pytestmark = pytest.mark.usefixtures("forget_terms")
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ import yaml
 
 from flashdex.cli.main import main
 from flashdex.envs.mdp import term
-from flashdex.envs.mdp.term import registry
 from flashdex.recipe import dump_recipe, load_recipe
 
 PACKAGE = '''
@@ -56,12 +55,7 @@ TERMS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def forget(monkeypatch):
-    """What a test registers and allows is gone after it."""
-    registry("rewards")
-    monkeypatch.setattr(term, "_TERMS", {k: dict(v) for k, v in term._TERMS.items()})
-    monkeypatch.setattr(term, "_ALLOWED", set(term._ALLOWED))
+pytestmark = pytest.mark.usefixtures("forget_terms")
 
 
 @pytest.fixture

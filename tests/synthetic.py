@@ -25,9 +25,12 @@ HINGES = np.array([[-0.4, 1.19, -0.13], [2.98, -1.19, 0.01]])
 FINGERS = np.array([1.4, 0.5, 0.4, 0.1, 0.8, 0.6, 0.9, 0.6, 0.9, 0.6, 0.7, 1.0])
 
 
-def write_library(path, hands):
-    """Write three motions of 40, 31 and 52 frames and open the library."""
-    writer = LibraryWriter(path, hand="xhand", fps=FPS)
+def write_library(path, hands, *, changes=None, manifest=None):
+    """Write three motions of 40, 31 and 52 frames and open the library.
+
+    ``changes`` holds functions by name of the motion; each changes its MotionRecord.
+    """
+    writer = LibraryWriter(path, hand="xhand", fps=FPS, manifest=manifest)
     box, ball = make_box(), make_ball()
     plans = {
         "right_box": ((False, True), (-1, 0), [box]),
@@ -38,8 +41,11 @@ def write_library(path, hands):
     disks[0] = [0.0, 0.0, 0.0, 0.8, 0.02]
     for name, (active, owner, objects) in plans.items():
         frames = make_frames(hands, LENGTHS[name], active, owner, objects)
-        writer.add(MotionRecord(name, frames, active, owner, objects, disks))
-    return MotionLibrary.load(writer.write())
+        record = MotionRecord(name, frames, active, owner, objects, disks)
+        for change in (changes or {}).get(name, ()):
+            change(record)
+        writer.add(record)
+    return MotionLibrary.load(writer.write(report="motion\n"))
 
 
 def make_frames(hands, length, active, owner, objects):

@@ -70,6 +70,16 @@ def _is_json(file: str) -> bool:
     return file.endswith((".json", ".jsonl"))
 
 
+def snapshot(path: Path) -> dict[str, bytes | int]:
+    """Content of every file, links and pipes by their kind only."""
+    return {
+        str(p.relative_to(path)): p.read_bytes()
+        if p.is_file() and not p.is_symlink()
+        else os.lstat(p).st_mode
+        for p in sorted(path.rglob("*"))
+    }
+
+
 def flip(path: Path, rng: Rng) -> None:
     """One bit is another."""
     data = bytearray(path.read_bytes())

@@ -86,7 +86,7 @@ def _outside(values: np.ndarray, low: float, high: float) -> np.ndarray | None:
     if values.min() >= low and values.max() <= high:
         return None
     flat = values.reshape(len(values), -1)
-    return ~((flat >= low) & (flat <= high)).all(-1)
+    return np.asarray(~((flat >= low) & (flat <= high)).all(-1))
 
 
 def _no_rotation(quat: np.ndarray) -> np.ndarray:
@@ -132,7 +132,7 @@ def _motion_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
         yield f"motions/hand_active: motion {row} has no hand"
     discs = arrays["motions/support_disks"]
     used = ~np.isnan(discs).any(-1)
-    is_right = np.abs(discs).max(-1) <= 100
+    is_right = np.asarray(np.abs(discs).max(-1) <= 100)
     is_right &= (discs[..., 3:] > 0).all(-1)
     is_right |= np.isnan(discs).all(-1)
     is_right[:, 1:] &= used[:, :-1] | ~used[:, 1:]  # the used ones come first
@@ -145,8 +145,10 @@ def _body_faults(body: Mapping[str, np.ndarray]) -> Iterator[str]:
     (low, high), com = body["aabb"].astype(np.float64), body["com"]
     size = high - low
     inertia, mass = body["inertia"].astype(np.float64), float(body["mass"])
-    if not np.isfinite(inertia).all() or not (size >= 0).all():
-        return  # the ranges have told it, or the box is inside out
+    if not np.isfinite(inertia).all():
+        return  # that it is not was told
+    if not (size > 0).all():
+        yield "its box has no inside"
     slack = 0.1 * size.max() + 1e-3
     if ((com < low - slack) | (com > high + slack)).any():
         yield f"its centre of mass {com.tolist()} lies outside of its box"

@@ -131,12 +131,10 @@ def _motion_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
     for row in np.flatnonzero(~arrays["motions/hand_active"].any(1)):
         yield f"motions/hand_active: motion {row} has no hand"
     discs = arrays["motions/support_disks"]
-    used = ~np.isnan(discs).any(-1)
-    is_right = np.asarray(np.abs(discs).max(-1) <= 100)
-    is_right &= (discs[..., 3:] > 0).all(-1)
-    is_right |= np.isnan(discs).all(-1)
-    is_right[:, 1:] &= used[:, :-1] | ~used[:, 1:]  # the used ones come first
-    for row in np.flatnonzero(~is_right.all(-1)):
+    is_free = np.asarray(np.isnan(discs).all(-1))
+    is_disc = np.asarray((np.abs(discs) <= 100).all(-1) & (discs[..., 3:] > 0).all(-1))
+    is_late = is_disc[:, 1:] & is_free[:, :-1]  # the used ones come first
+    for row in np.flatnonzero((~(is_free | is_disc)).any(-1) | is_late.any(-1)):
         yield f"motions/support_disks: those of motion {row} are no discs"
 
 
@@ -279,4 +277,4 @@ def hash_rows(
 
 def _add(digest: Any, name: str, values: np.ndarray) -> None:
     digest.update(f"{name} {values.dtype} {values.shape}".encode())
-    digest.update(np.ascontiguousarray(values).reshape(-1).view(np.uint8))
+    digest.update(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)

@@ -67,7 +67,7 @@ def write_array(path: Path, array: np.ndarray) -> ArrayEntry:
     # of what is meant, not of what a disk made of it; numpy's own way of writing does
     # not see every error of a full one
     digest = hashlib.sha256(head.getvalue())
-    data = array.reshape(-1).view(np.uint8)
+    data = array.reshape(-1).view(np.uint8).data
     digest.update(data)
     with path.open("xb") as file:
         file.write(head.getvalue())

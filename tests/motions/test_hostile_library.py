@@ -39,9 +39,7 @@ def test_metadata_of_the_old_kind_runs_nothing(copy, tmp_path, schema):
             (folder / part / "other.pickle").write_bytes(pickle.dumps(Bomb(mark)))
     if schema == 1:
         edit_manifest(copy, lambda m: m.update(schema=1))
-        with pytest.raises(
-            LibraryError, match=r"schema 1, this version .*again"
-        ):
+        with pytest.raises(LibraryError, match=r"schema 1, this version .*again"):
             MotionLibrary.load(copy)
     else:
         assert MotionLibrary.load(copy).num_motions == 3

@@ -9,6 +9,7 @@ import json
 import logging
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,14 @@ from flashdex.algorithms.base import Learner, TaskSpec
 from flashdex.datasets.source import SourceOptions
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene.scene import Scene
+from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.assembly import make_transforms
 from flashdex.errors import DemoError, FlashdexError, LibraryError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import MANIFEST, OldLibraryError
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
@@ -55,8 +57,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
         )
     folder = Path("libraries") / library_name(recipe)
     order = _order(recipe)
-    if (folder / "manifest.json").is_file():
-        library = MotionLibrary.load(folder)
+    if (library := _load_current(folder)) is not None:
         try:
             if library.manifest.get("inputs") == hash_inputs(order):
                 return library
@@ -66,6 +67,17 @@ def load_library(recipe: Recipe) -> MotionLibrary:
         _LOG.info("the recordings have changed since %s was prepared", folder)
     _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
     return run_order(order, folder)
+
+
+def _load_current(folder: Path) -> MotionLibrary | None:
+    """An automatic library; None where there is none of this version."""
+    if not (folder / MANIFEST).is_file():
+        return None
+    try:
+        return MotionLibrary.load(folder)
+    except OldLibraryError as error:
+        _LOG.info("%s", error)
+        return None
 
 
 def _order(recipe: Recipe) -> Order:
@@ -185,6 +197,11 @@ class RunBuilder:
             device = engine_device(recipe.physics)
         return cls(recipe, library, hands, ReferenceBank(library, hands).to(device))
 
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """Scenes of all motions; environments and scoring share them."""
+        return build_scenes(self.library, self.hands, self.recipe.physics)
+
     @property
     def step_dt(self) -> float:
         """Control step, s."""
@@ -200,7 +217,9 @@ class RunBuilder:
         """Build physics and environment, as the recipe says where None."""
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
-        physics = make_physics(self.library, self.hands, recipe.physics, count)
+        physics = make_physics(
+            self.library, self.hands, recipe.physics, count, self.scenes
+        )
         return TrackingEnv(
             physics,
             self.bank,

@@ -23,7 +23,7 @@ from flashdex.algorithms import find_algorithm
 from flashdex.algorithms.base import Learner, TaskSpec
 from flashdex.datasets.source import SourceOptions
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
-from flashdex.envs.reference import ReferenceBank
+from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.assembly import make_transforms
@@ -38,6 +38,7 @@ from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
 from flashdex.system.machine import versions
 
+JOINT_SLACK = 0.5  # m or rad beyond a hand's range that a reference may ask for
 _LOG = logging.getLogger(__name__)
 
 
@@ -158,6 +159,30 @@ def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
     )
 
 
+def _check_joints(library: MotionLibrary, hands: dict[keys.Side, HandSpec]) -> None:
+    """A hand of the library's name may have changed since, or be another's."""
+    found = library.frames["joint_pos"].shape[-1]
+    ranges = stack_hands(hands, "joint_range")
+    if found != ranges.shape[1]:
+        raise LibraryError(
+            f"{library.path}: has {found} joints of '{library.hand}', the hand has "
+            f"{ranges.shape[1]}. Prepare it again for this hand."
+        )
+    low, high = ranges[..., 0] - JOINT_SLACK, ranges[..., 1] + JOINT_SLACK
+    for row, name in enumerate(library.names):
+        start, length = (int(library.motions[k][row]) for k in ("start", "length"))
+        pos = library.frames["joint_pos"][start : start + length]
+        outside = ((pos < low) | (pos > high)).any(0)
+        outside &= library.motions["hand_active"][row].unsqueeze(-1)
+        if outside.any():
+            side, joint = outside.nonzero()[0].tolist()
+            joint_name = hands[keys.SIDES[side]].joint_names[joint]
+            raise LibraryError(
+                f"{library.path}: motion {name!a} bends '{joint_name}' beyond its "
+                "range: it is of another hand. Prepare it again for this one."
+            )
+
+
 @dataclass(frozen=True)
 class RunBuilder:
     """Builds the parts of a run: environment, learner, rollouts."""
@@ -183,6 +208,7 @@ class RunBuilder:
                 f"{library.path}: prepared for hand '{library.hand}', the recipe asks "
                 f"for '{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
             )
+        _check_joints(library, hands)
         step_dt = recipe.physics.timestep * recipe.physics.decimation
         if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):
             decimation = round(1 / (library.fps * recipe.physics.timestep))

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mutations import KINDS
 from PIL import Image
 from synthetic import write_library
 
@@ -379,6 +380,16 @@ def test_two_thousand_recordings_are_a_light_page(mine):
 def test_a_report_that_is_no_table_is_refused(mine):
     cell = "x" * (csv.field_size_limit() + 1)
     (mine.path / "report.csv").write_text(f"motion,status\n{cell},kept\n")
+    with pytest.raises(LibraryError, match=r"report\.csv: not a readable table"):
+        write_library_report(mine, thumbnails=False)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "folder", "fifo"])
+def test_a_report_that_is_no_file_of_the_library_is_not_shown(
+    mine, tmp_path, monkeypatch, kind
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    KINDS[kind](mine.path / "report.csv", np.random.default_rng(0))
     with pytest.raises(LibraryError, match=r"report\.csv: not a readable table"):
         write_library_report(mine, thumbnails=False)
 

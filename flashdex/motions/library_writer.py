@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -238,10 +239,13 @@ def check_target(path: Path) -> None:
     if not folder.is_dir():
         kind = "a link to nothing" if folder.is_symlink() else "not a folder"
         raise LibraryError(f"{path}: could not write the library: {folder} is {kind}.")
-    if not os.access(folder, os.W_OK | os.X_OK):
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
         raise LibraryError(
-            f"{path}: could not write the library: {folder} cannot be written."
-        )
+            f"{path}: could not write the library: {folder} refuses ({error.strerror})."
+        ) from error
     if folder is path:
         held = [n for n in os.listdir(path) if n != LOCK]
         ours = [n for n in held if DATA.fullmatch(n) or TEMPORARY.fullmatch(n)]

@@ -13,15 +13,9 @@ import trimesh
 from tensordict import TensorDict
 
 from flashdex.errors import LibraryError, nearest
-from flashdex.motions.library_check import check_all, check_once
-from flashdex.motions.library_format import (
-    ARRAYS,
-    Manifest,
-    as_library_error,
-    read_manifest,
-)
+from flashdex.motions.library_check import check_all, check_once, map_arrays
+from flashdex.motions.library_format import ARRAYS, read_manifest
 from flashdex.motions.library_meshes import Mesh, read_mesh
-from flashdex.system.arrays import map_array
 
 
 @dataclass
@@ -61,7 +55,7 @@ class MotionLibrary:
         """
         path = Path(path)
         manifest = read_manifest(path)
-        arrays = _map_arrays(path, manifest)
+        arrays = map_arrays(path, manifest)
         check_once(path, manifest, arrays)
         parts = {part: _as_tensors(arrays, part) for part in _parts(arrays)}
         return cls(
@@ -78,7 +72,7 @@ class MotionLibrary:
         """
         try:
             manifest = read_manifest(self.path)
-            faults = check_all(self.path, manifest, _map_arrays(self.path, manifest))
+            faults = check_all(self.path, manifest, map_arrays(self.path, manifest))
         except LibraryError as error:
             return [str(error)]
         if manifest.sha256 != self.content_hash:
@@ -154,14 +148,6 @@ class MotionLibrary:
             data = self.manifest["data"]
             self._meshes[file] = read_mesh(self.path, data, file, digest)
         return self._meshes[file]
-
-
-def _map_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
-    with as_library_error():
-        return {
-            name: map_array(path, f"{manifest.data}/{name}.npy", entry)
-            for name, entry in manifest.arrays.items()
-        }
 
 
 def _parts(arrays: Mapping[str, np.ndarray]) -> list[str]:

@@ -29,7 +29,7 @@ from flashdex.motions.library_format import (
 )
 from flashdex.motions.library_meshes import read_mesh
 from flashdex.objects.asset import default_cache_dir
-from flashdex.system.arrays import hash_content
+from flashdex.system.arrays import hash_content, map_array
 from flashdex.system.files import own_file
 
 Arrays = Mapping[str, np.ndarray]
@@ -183,6 +183,19 @@ def find_changes(path: Path, manifest: Manifest, arrays: Arrays) -> Iterator[str
         for row, digest in zip(manifest.entries[part], hashes, strict=True):
             if row["content_sha256"] != digest:
                 yield f"{part}: {row['name']!a} is not what its hash says"
+
+
+def map_arrays(path: Path, manifest: Manifest) -> dict[str, np.ndarray]:
+    """Map all arrays of a library; nothing of their content is read.
+
+    Raises:
+        LibraryError: one is missing, a link, or not as the manifest announces it.
+    """
+    with as_library_error():
+        return {
+            name: map_array(path, f"{manifest.data}/{name}.npy", entry)
+            for name, entry in manifest.arrays.items()
+        }
 
 
 def check_once(path: Path, manifest: Manifest, arrays: Arrays) -> None:

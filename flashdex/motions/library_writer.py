@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 
 from flashdex.errors import LibraryError
-from flashdex.motions.library_check import find_faults, hash_rows
+from flashdex.motions.library_check import (
+    check_all,
+    find_faults,
+    hash_rows,
+    map_arrays,
+)
 from flashdex.motions.library_format import (
     ARRAYS,
     CONVENTIONS,
@@ -27,6 +32,7 @@ from flashdex.motions.library_format import (
     QUALITY_KEYS,
     SCHEMA,
     parse_manifest,
+    read_manifest,
 )
 from flashdex.motions.library_meshes import write_meshes
 from flashdex.objects.asset import ObjectAsset
@@ -135,6 +141,10 @@ class LibraryWriter:
             # names of files and texts in them may hold what is no character
             told = report.encode("utf-8", errors="backslashreplace")
             (work / REPORT).write_bytes(told)
+            # runs of a sweep prepare the same and read what is there already
+            if _is_whole(self.path, parse_manifest(manifest).sha256):
+                os.replace(work / REPORT, self.path / REPORT)
+                return
             os.replace(work, self.path / data)
             write_atomic(self.path / MANIFEST, json.dumps(manifest, indent=1))
             # what needs room on the disk is done: from here on nothing can be lost
@@ -145,37 +155,36 @@ class LibraryWriter:
 
     def _fill(self, work: Path) -> dict[str, Any]:
         """Write all data; return the manifest, but for the name of its folder."""
-        assets = list(self._objects.values())
-        names = _unique_names(assets)
-        entries, meshes = [], {}
-        for name, asset in zip(names, assets, strict=True):
-            files, hashes = write_meshes(work, name, asset)
-            told = {"sha256": asset.sha256, "watertight": bool(asset.watertight)}
-            entries.append({"name": name, **told, **files})
-            meshes |= hashes
+        objects, meshes = self._write_objects(work)
         arrays = self._stack()
-        manifest = self._manifest | {
-            "motions": [{**r.info, "name": r.name} for r in self._records],
-            "objects": entries,
-            "meshes": meshes,
-            "arrays": {},
-        }
-        for part, hashes in zip(
-            ("motions", "objects"), hash_rows(manifest, arrays, meshes), strict=True
-        ):
-            for entry, digest in zip(manifest[part], hashes, strict=True):
-                entry["content_sha256"] = digest
+        motions = [{**r.info, "name": r.name} for r in self._records]
+        manifest = self._manifest | {"motions": motions, "objects": objects}
+        hashes = hash_rows(manifest, arrays, meshes)
+        for rows, digests in zip((motions, objects), hashes, strict=True):
+            for row, digest in zip(rows, digests, strict=True):
+                row["content_sha256"] = digest
         for part in dict.fromkeys(name.split("/")[0] for name in arrays):
             (work / part).mkdir()
-        for name, array in arrays.items():
-            file = work / f"{name}.npy"
-            manifest["arrays"][name] = write_array(file, array).to_dict()
+        written = {n: write_array(work / f"{n}.npy", a) for n, a in arrays.items()}
+        manifest["meshes"] = meshes
+        manifest["arrays"] = {name: e.to_dict() for name, e in written.items()}
         # what is written can be opened, or the old one stays
         manifest = json.loads(json.dumps(manifest))
         parsed = parse_manifest(manifest | {"data": "data-" + 16 * "0"})
         if faults := list(find_faults(parsed, arrays)):
             raise LibraryError(f"{self.path}: is not written: {'; '.join(faults[:5])}")
         return manifest
+
+    def _write_objects(self, work: Path) -> tuple[list[dict], dict[str, str]]:
+        """Write all meshes; return entries of the objects, and hashes of the files."""
+        assets = list(self._objects.values())
+        entries, meshes = [], {}
+        for name, asset in zip(_unique_names(assets), assets, strict=True):
+            files, hashes = write_meshes(work, name, asset)
+            told = {"sha256": asset.sha256, "watertight": bool(asset.watertight)}
+            entries.append({"name": name, **told, **files})
+            meshes |= hashes
+        return entries, meshes
 
     def _stack(self) -> dict[str, np.ndarray]:
         """All arrays of the library, each of its declared type."""
@@ -273,6 +282,17 @@ def _read_old(path: Path) -> Any:
     ):
         return json.loads(f.read(MAX_MANIFEST).decode("utf-8"))
     return None
+
+
+def _is_whole(path: Path, sha256: str) -> bool:
+    """Whether a library of this hash is there, and nothing in it is damaged."""
+    try:
+        found = read_manifest(path)
+        if found.sha256 != sha256:
+            return False
+        return not check_all(path, found, map_arrays(path, found))
+    except LibraryError:
+        return False
 
 
 def _is_old(path: Path) -> bool:

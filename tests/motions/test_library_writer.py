@@ -94,6 +94,21 @@ def test_a_mount_point_is_renewed(copy, record, monkeypatch):
     assert names_of(copy) == ["new"]
 
 
+def test_the_same_again_leaves_what_others_read(tmp_path, record):
+    first = MotionLibrary.load(write([record], tmp_path / "lib"))
+    again = MotionLibrary.load(write([record], tmp_path / "lib"))
+    assert first.manifest["data"] == again.manifest["data"]
+    assert len(first.parts(0)) == 1
+    assert len(os.listdir(tmp_path / "lib")) == 4
+
+
+def test_the_same_again_mends_what_is_damaged(tmp_path, record):
+    path = write([record], tmp_path / "lib")
+    (mesh,) = path.glob("data-*/meshes/box/visual.obj")
+    mesh.write_text("")
+    assert names_of(write([record], path)) == ["new"]
+
+
 def thesis(path):
     path.mkdir()
     (path / "thesis.txt").write_text("precious")

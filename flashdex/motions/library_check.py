@@ -50,8 +50,17 @@ del LIMITS["motions/support_disks"]
 QUAT_SLACK = 1e-3  # of a norm from 1
 
 
-def find_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
-    """What is wrong with the numbers of a library; each line names array and row."""
+def find_faults(manifest: Manifest, arrays: Arrays) -> list[str]:
+    """What is wrong with the numbers of a library; each line names array and row.
+
+    Raises:
+        LibraryError: its frames are not those of its motions.
+    """
+    with np.errstate(all="ignore"):  # numbers of any kind are expected here
+        return list(_faults(manifest, arrays))
+
+
+def _faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
     yield from _motion_faults(manifest, arrays)
     names = manifest.names("motions")
     starts = arrays["motions/start"]

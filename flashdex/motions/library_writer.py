@@ -171,7 +171,7 @@ class LibraryWriter:
         # what is written can be opened, or the old one stays
         manifest = json.loads(json.dumps(manifest))
         parsed = parse_manifest(manifest | {"data": "data-" + 16 * "0"})
-        if faults := list(find_faults(parsed, arrays)):
+        if faults := find_faults(parsed, arrays):
             raise LibraryError(f"{self.path}: is not written: {'; '.join(faults[:5])}")
         return manifest
 

@@ -156,6 +156,7 @@ def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
         motions=motions,
         objects=library.objects,
         manifest=manifest,
+        content_hash=library.content_hash,
     )
 
 

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError, nearest
 from flashdex.motions.library_check import check_all, check_once, map_arrays
-from flashdex.motions.library_format import ARRAYS, read_manifest
+from flashdex.motions.library_format import AGAIN, ARRAYS, read_manifest
 from flashdex.motions.library_meshes import Mesh, read_mesh
 
 
@@ -56,7 +56,8 @@ class MotionLibrary:
         path = Path(path)
         manifest = read_manifest(path)
         arrays = map_arrays(path, manifest)
-        check_once(path, manifest, arrays)
+        refusal = f"is damaged, or was changed, and is not used. {AGAIN}"
+        check_once(path, manifest, arrays, refusal=refusal)
         parts = {part: _as_tensors(arrays, part) for part in _parts(arrays)}
         return cls(
             path=path,

@@ -23,7 +23,8 @@ from flashdex.system.names import check_name, check_names
 
 SCHEMA = 2
 MANIFEST = "manifest.json"
-MAX_MANIFEST = 128 << 20  # bytes; a thousand motions have some 3 MB
+MAX_MANIFEST = 32 << 20  # bytes; a thousand motions have about one million
+MAX_PARTS = 256  # of an object
 FPS_RANGE = (1.0, 10_000.0)  # 1/s
 NUM_OBJECT_SLOTS = 2
 CONVENTIONS = {
@@ -259,10 +260,12 @@ def _check_rows(entries: Mapping[str, Any]) -> None:
     for row in entries["objects"]:
         parts = row.get("parts")
         files = [*parts, row.get("visual")] if isinstance(parts, list) else []
-        if len(files) < 2 or not all(
-            isinstance(f, str) and f in entries["meshes"] for f in files
-        ):
-            raise LibraryError(f"object {row['name']!a}: its meshes are not listed.")
+        is_listed = all(isinstance(f, str) and f in entries["meshes"] for f in files)
+        if not is_listed or not 2 <= len(set(files)) == len(files) <= MAX_PARTS + 1:
+            raise LibraryError(
+                f"object {row['name']!a}: its meshes are not listed, or not once each, "
+                f"or it has over {MAX_PARTS} parts."
+            )
         if not isinstance(row.get("watertight"), bool):
             raise LibraryError(f"object {row['name']!a}: 'watertight' is no bool.")
 

@@ -16,6 +16,7 @@ from flashdex.objects.asset import ObjectAsset
 from flashdex.system.files import open_plain, own_file
 from flashdex.system.names import file_stem
 
+MAX_MESH = 64 << 20  # bytes; a visual mesh has 5,000 triangles
 Mesh = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
@@ -63,9 +64,11 @@ def read_mesh(path: Path, data: str, name: str, sha256: str) -> Mesh:
         file = own_file(path, data, name)
     try:
         with open_plain(file) as stream:
-            text = stream.read()
+            text = stream.read(MAX_MESH + 1)
         fault = ""
-        if hashlib.sha256(text).hexdigest() != sha256:
+        if len(text) > MAX_MESH:
+            fault = f"is larger than {MAX_MESH >> 20} MiB"
+        elif hashlib.sha256(text).hexdigest() != sha256:
             fault = "is not the mesh that the library was made with"
         else:
             return _parse_obj(text.decode("ascii"))

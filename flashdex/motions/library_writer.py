@@ -18,7 +18,7 @@ import numpy as np
 from flashdex.errors import LibraryError
 from flashdex.motions.library_check import (
     check_all,
-    find_faults,
+    check_once,
     hash_rows,
     map_arrays,
 )
@@ -142,10 +142,14 @@ class LibraryWriter:
             told = report.encode("utf-8", errors="backslashreplace")
             (work / REPORT).write_bytes(told)
             # runs of a sweep prepare the same and read what is there already
-            if _is_whole(self.path, parse_manifest(manifest).sha256):
+            parsed = parse_manifest(manifest)
+            if _is_whole(self.path, parsed.sha256):
                 os.replace(work / REPORT, self.path / REPORT)
                 return
             os.replace(work, self.path / data)
+            # what is written can be opened, or the old one stays
+            arrays = map_arrays(self.path, parsed)
+            check_once(self.path, parsed, arrays, refusal="is not written")
             write_atomic(self.path / MANIFEST, json.dumps(manifest, indent=1))
             # what needs room on the disk is done: from here on nothing can be lost
             os.replace(self.path / data / REPORT, self.path / REPORT)
@@ -168,12 +172,7 @@ class LibraryWriter:
         written = {n: write_array(work / f"{n}.npy", a) for n, a in arrays.items()}
         manifest["meshes"] = meshes
         manifest["arrays"] = {name: e.to_dict() for name, e in written.items()}
-        # what is written can be opened, or the old one stays
-        manifest = json.loads(json.dumps(manifest))
-        parsed = parse_manifest(manifest | {"data": "data-" + 16 * "0"})
-        if faults := find_faults(parsed, arrays):
-            raise LibraryError(f"{self.path}: is not written: {'; '.join(faults[:5])}")
-        return manifest
+        return json.loads(json.dumps(manifest))
 
     def _write_objects(self, work: Path) -> tuple[list[dict], dict[str, str]]:
         """Write all meshes; return entries of the objects, and hashes of the files."""

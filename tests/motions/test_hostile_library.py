@@ -14,6 +14,7 @@ from flashdex.errors import FlashdexError, LibraryError
 from flashdex.motions import library_check
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_format import ARRAYS
+from flashdex.system.arrays import hash_content
 
 
 class Bomb:
@@ -101,6 +102,8 @@ NUMBERS = {
     "inertia-not-symmetric": put("objects/inertia", (0, 0, 1), 5e-5),
     "inertia-large": scale("objects/inertia", 1e3),
     "com-outside": put("objects/com", (0, 0), 0.2),
+    "points-outside": scale("objects/points", 3, (0, 5)),
+    "radius-of-others": scale("objects/radius", 1.5),
     "box-inside-out": scale("objects/aabb", -1),
     "start-later": put("motions/start", 1, 41),
     "start-overlaps": put("motions/start", 1, 0),
@@ -156,6 +159,54 @@ def test_meshes_of_no_body_are_refused_though_hashes_fit(copy, case, file):
     (data_of(copy) / "meshes/box" / file).write_bytes(MESHES[case])
     forge_library(copy, lambda entries, arrays: None)
     with pytest.raises(LibraryError, match=f"meshes/box/{file}: cannot be read"):
+        MotionLibrary.load(copy)
+
+
+def moved(vertices):
+    return vertices + 0.2
+
+
+def flat(vertices):
+    return vertices * [1, 1, 0]
+
+
+def many(vertices):
+    return np.random.default_rng(0).uniform(-0.02, 0.02, (10_001, 3))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (moved, "lies outside of the box of its object"),
+        (lambda v: 1000 * v, "lies outside of the box of its object"),
+        (flat, "is flat"),
+        (many, "has 10001 vertices, 10000 are allowed"),
+    ],
+    ids=["moved", "millimetres", "flat", "bomb"],
+)
+def test_parts_that_no_simulation_takes_are_refused(copy, change, text):
+    file = data_of(copy) / "meshes/box/part_000.obj"
+    lines = [line.split() for line in file.read_text().splitlines()]
+    vertices = change(
+        np.array([words[1:] for words in lines if words[0] == "v"], float)
+    )
+    rows = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
+    file.write_text("\n".join([*rows, "f 1 2 3", ""]))
+    forge_library(copy, lambda entries, arrays: None)
+    with pytest.raises(LibraryError, match=f"meshes/box/part_000.obj: {text}"):
+        MotionLibrary.load(copy)
+
+
+def test_truth_values_of_no_kind_are_refused(copy):
+    file = data_of(copy) / "motions/hand_active.npy"
+    data = file.read_bytes()
+    file.write_bytes(data[:-1] + b"\x07")  # neither true nor false
+    entry_hash = hash_content(file)
+    edit_manifest(
+        copy,
+        lambda m: m["arrays"]["motions/hand_active"].update(sha256=entry_hash),
+    )
+    with pytest.raises(LibraryError, match="motions/hand_active: holds"):
         MotionLibrary.load(copy)
 
 

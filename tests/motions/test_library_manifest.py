@@ -56,6 +56,9 @@ MANIFESTS = {
     "parts-none": lambda m: m["objects"][0].update(parts=[]),
     "parts-text": lambda m: m["objects"][0].update(parts="meshes/box/visual.obj"),
     "parts-twice": lambda m: m["objects"][0]["parts"].append("meshes/box/visual.obj"),
+    "parts-bomb": lambda m: m["objects"][0].update(
+        parts=m["objects"][0]["parts"] * 1000
+    ),
     "part-outside": lambda m: m["objects"][0].update(parts=["../../evil.obj"]),
     "part-unlisted": lambda m: m["objects"][0].update(parts=["meshes/box/a.obj"]),
     "visual-absolute": lambda m: m["objects"][0].update(visual="/etc/passwd"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import pickle
 import re
 import zipfile
@@ -14,12 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-
-from flashdex.datasets.pickles import MAX_BYTES, RefusedError, check_sizes, unpickle
+from flashdex.datasets.pickles import RefusedError, unpickle
 from flashdex.errors import DemoError
+from flashdex.system.arrays import MAX_BYTES, check_archive, read_array, read_npz
 
 POINTER_START = b"version https://git-lfs"
+MAX_TEXT = 256 << 20  # bytes of a text file
 POINTER_SIZE = 200  # bytes; a pointer holds three short lines
 # what is raised by content of another layout, or nested too deep
 BROKEN = (
@@ -48,6 +47,20 @@ def refuse_pointer(file: Path) -> None:
             f"{file}: a Git-LFS pointer, not the file itself. Download the content: "
             f"git lfs pull, or the dataset's own tool.",
             code="E_ROOT",
+        )
+
+
+def refuse_large(file: Path, most: int) -> None:
+    """Refuse a file of more bytes than any recording has; a sparse one costs nothing.
+
+    What is read whole, and parsed, must fit in memory several times.
+    """
+    size = file.stat().st_size
+    if size > most:
+        raise DemoError(
+            f"{file}: {size / 2**20:.0f} MiB; at most {most >> 20} MiB are read. Cut "
+            f"the recording, or get the file anew.",
+            code="E_FILE",
         )
 
 
@@ -80,8 +93,19 @@ def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[
 def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
     """The content of a JSON file; ``fault`` says of another file what it is not."""
     with told(file, fault, code=code):
-        refuse_pointer(file)
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_text(file))
+
+
+def read_text(file: Path) -> str:
+    """A text file of bounded size, UTF-8; an ``OSError`` or ``UnicodeDecodeError``."""
+    return read_bytes(file, most=MAX_TEXT).decode("utf-8")
+
+
+def read_bytes(file: Path, *, most: int = MAX_BYTES) -> bytes:
+    """A regular file of at most so many bytes, whole; an ``OSError`` is not told."""
+    refuse_pointer(file)
+    refuse_large(file, most)
+    return file.read_bytes()
 
 
 def load_pickle(path: Path) -> Any:
@@ -91,7 +115,7 @@ def load_pickle(path: Path) -> Any:
 
 def load_npy(path: Path) -> Any:
     """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _open(path, ".npy array", lambda file: _read_array(file.read()))
+    return _open(path, ".npy array", _read_npy)
 
 
 def load_npz(
@@ -103,14 +127,8 @@ def load_npz(
     entries that hold objects.
     """
     kind = ".npz without pickles" if plain else ".npz archive"
-    entries = _open(path, kind, partial(_read_npz, only=only))
-    for name, array in entries.items():
-        if plain and (not isinstance(array, np.ndarray) or array.dtype.kind == "O"):
-            raise DemoError(
-                f"{path}: not a readable {kind}: '{name}' holds objects. Store plain "
-                f"arrays; text as np.array([...], dtype=str)."
-            )
-    return entries
+    reader = None if plain else unpickle
+    return _open(path, kind, partial(read_npz, only=only, objects=reader))
 
 
 def load_torch(path: Path) -> Any:
@@ -122,6 +140,7 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
     try:
         refuse_pointer(path)
         with path.open("rb") as file:
+            refuse_large(path, MAX_BYTES)
             return read(file)
     except DemoError:
         raise
@@ -143,41 +162,8 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
         ) from error
 
 
-def _read_array(data: bytes) -> Any:
-    file = io.BytesIO(data)
-    version = "_".join(map(str, np.lib.format.read_magic(file)))
-    shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(
-        file
-    )
-    if dtype.kind == "O":
-        array = unpickle(file)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
-            raise ValueError("an object array that holds something else")
-        return array.item() if array.ndim == 0 else array
-    count = math.prod(check_sizes(shape))
-    if dtype.hasobject or count * dtype.itemsize > len(data):
-        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
-    raw = bytearray(file.read(count * dtype.itemsize))
-    return np.frombuffer(raw, dtype, count).reshape(
-        shape, order="F" if by_columns else "C"
-    )
-
-
-def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
-    with zipfile.ZipFile(file) as archive:
-        _check_size(archive)
-        files = [name for name in archive.namelist() if name.endswith(".npy")]
-        if not files:
-            raise ValueError("it holds no .npy entries")
-        names = {name.removesuffix(".npy"): name for name in files}
-        wanted = {k: v for k, v in names.items() if only is None or k in only}
-        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
-
-
-def _check_size(archive: zipfile.ZipFile) -> None:
-    size = sum(member.file_size for member in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
+def _read_npy(file: IO[bytes]) -> Any:
+    return read_array(file.read(), objects=unpickle)
 
 
 def _read_torch(file: IO[bytes]) -> Any:
@@ -185,7 +171,7 @@ def _read_torch(file: IO[bytes]) -> Any:
 
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
-            _check_size(archive)
+            check_archive(archive, archive.namelist())
     file.seek(0)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)

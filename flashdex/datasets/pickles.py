@@ -4,7 +4,7 @@ Licensed datasets come as pickles, object arrays and torch files (see ``files``)
 pickle may name stands in ``ALLOWED``; every other name is refused and told. What it
 names is a stand-in that only keeps what it is given; plain values are made of it
 afterwards, from checked sizes and indices. So no name can be called to an effect, and
-no class of a library is within reach. Nothing becomes more than 4 GiB.
+no class of a library is within reach. Nothing becomes more than 2 GiB.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
-MAX_BYTES = 4 << 30  # of what a file becomes; more is a mistake or an attack
+from flashdex.system.arrays import MAX_BYTES, check_sizes
+
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
 # what an old torch file begins with, its version, and the storages it may hold
 MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001
@@ -120,17 +121,6 @@ def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
     return flat.reshape(shape, order=order)
 
 
-def check_sizes(given: Any) -> tuple[int, ...]:
-    """Whole numbers from 0 up."""
-    sizes = (given,) if isinstance(given, int) else given
-    known = isinstance(sizes, (tuple, list)) and len(sizes) <= 32
-    if not known or not all(
-        isinstance(n, (int, np.integer)) and 0 <= n <= MAX_BYTES for n in sizes
-    ):
-        raise ValueError(f"{given!r} are not sizes")
-    return tuple(int(n) for n in sizes)
-
-
 def _chumpy_select(args: tuple, state: Any) -> np.ndarray:
     """Elements of an array, in a new shape."""
     flat = np.asarray(state["a"]).ravel()
@@ -199,7 +189,7 @@ def _tensor(args: tuple, state: Any) -> Any:
     if count and last >= flat.numel():
         raise ValueError(f"a tensor of shape {sizes} that leaves its storage")
     if count * flat.element_size() > MAX_BYTES:
-        raise ValueError(f"a tensor of shape {sizes} becomes more than 4 GiB")
+        raise ValueError(f"a tensor of shape {sizes} becomes more than 2 GiB")
     return flat.as_strided(sizes, strides, offset if count else 0).clone()
 
 
@@ -308,7 +298,7 @@ def unpickle(file: IO[bytes]) -> Any:
             length = len(made) if isinstance(made, (*CONTAINERS, dict)) else 0
             size += getattr(made, "nbytes", 0) or 8 * length
             if size > MAX_BYTES:
-                raise ValueError("it becomes more than 4 GiB")
+                raise ValueError("it becomes more than 2 GiB")
         if done[key] is BUSY:
             raise ValueError("a part that contains itself")
         return done[key]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import pickle
 import re
 import zipfile
@@ -13,9 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from flashdex.datasets.pickles import RefusedError, unpickle
-from flashdex.errors import DemoError
-from flashdex.system.arrays import MAX_BYTES, check_archive, read_array, read_npz
+import numpy as np
+
+from flashdex.datasets.pickles import MAX_BYTES, RefusedError, unpickle
+from flashdex.datasets.pickles import check_sizes as check_shape
+from flashdex.errors import DemoError, is_of_machine
+from flashdex.system.archives import check_sizes
 
 POINTER_START = b"version https://git-lfs"
 MAX_TEXT = 256 << 20  # bytes of a text file
@@ -78,11 +82,14 @@ def refuse_clone(files: Iterable[Path]) -> None:
 def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[None]:
     """Turns what content of another layout raises into one message.
 
+    Errors of the machine pass as they are, see ``is_of_machine``.
     ``fault`` says what it is not, and what to do.
     """
     try:
         yield
     except OSError as error:
+        if is_of_machine(error):
+            raise
         text = f"{where}: cannot be read: {error.strerror or error}."
         raise DemoError(text, code="E_FILE") from error
     except BROKEN as error:
@@ -105,7 +112,8 @@ def read_bytes(file: Path, *, most: int = MAX_BYTES) -> bytes:
     """A regular file of at most so many bytes, whole; an ``OSError`` is not told."""
     refuse_pointer(file)
     refuse_large(file, most)
-    return file.read_bytes()
+    with file.open("rb") as stream:
+        return stream.read()
 
 
 def load_pickle(path: Path) -> Any:
@@ -115,7 +123,7 @@ def load_pickle(path: Path) -> Any:
 
 def load_npy(path: Path) -> Any:
     """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _open(path, ".npy array", _read_npy)
+    return _open(path, ".npy array", lambda file: _read_array(file.read()))
 
 
 def load_npz(
@@ -127,8 +135,14 @@ def load_npz(
     entries that hold objects.
     """
     kind = ".npz without pickles" if plain else ".npz archive"
-    reader = None if plain else unpickle
-    return _open(path, kind, partial(read_npz, only=only, objects=reader))
+    entries = _open(path, kind, partial(_read_npz, only=only))
+    for name, array in entries.items():
+        if plain and (not isinstance(array, np.ndarray) or array.dtype.kind == "O"):
+            raise DemoError(
+                f"{path}: not a readable {kind}: '{name}' holds objects. Store plain "
+                f"arrays; text as np.array([...], dtype=str)."
+            )
+    return entries
 
 
 def load_torch(path: Path) -> Any:
@@ -152,7 +166,11 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
             code="E_PICKLE",
         ) from error
     except OSError as error:
+        if is_of_machine(error):
+            raise
         raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except MemoryError:
+        raise
     # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
     except Exception as error:
         told = " ".join(str(error).split())[:200] or type(error).__name__
@@ -162,8 +180,35 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
         ) from error
 
 
-def _read_npy(file: IO[bytes]) -> Any:
-    return read_array(file.read(), objects=unpickle)
+def _read_array(data: bytes) -> Any:
+    file = io.BytesIO(data)
+    version = "_".join(map(str, np.lib.format.read_magic(file)))
+    shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(
+        file
+    )
+    if dtype.kind == "O":
+        array = unpickle(file)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
+            raise ValueError("an object array that holds something else")
+        return array.item() if array.ndim == 0 else array
+    count = math.prod(check_shape(shape))
+    if dtype.hasobject or count * dtype.itemsize > len(data):
+        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
+    raw = bytearray(file.read(count * dtype.itemsize))
+    return np.frombuffer(raw, dtype, count).reshape(
+        shape, order="F" if by_columns else "C"
+    )
+
+
+def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
+    with zipfile.ZipFile(file) as archive:
+        check_sizes(archive, limit=MAX_BYTES)
+        files = [name for name in archive.namelist() if name.endswith(".npy")]
+        if not files:
+            raise ValueError("it holds no .npy entries")
+        names = {name.removesuffix(".npy"): name for name in files}
+        wanted = {k: v for k, v in names.items() if only is None or k in only}
+        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
 
 
 def _read_torch(file: IO[bytes]) -> Any:
@@ -171,7 +216,7 @@ def _read_torch(file: IO[bytes]) -> Any:
 
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
-            check_archive(archive, archive.namelist())
+            check_sizes(archive, limit=MAX_BYTES)
     file.seek(0)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)

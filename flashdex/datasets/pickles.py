@@ -22,7 +22,7 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
-from flashdex.system.arrays import MAX_BYTES, check_sizes
+MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
 # what an old torch file begins with, its version, and the storages it may hold
@@ -119,6 +119,17 @@ def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(raw, dtype).astype(dtype.newbyteorder("="))
     return flat.reshape(shape, order=order)
+
+
+def check_sizes(given: Any) -> tuple[int, ...]:
+    """Whole numbers from 0 up."""
+    sizes = (given,) if isinstance(given, int) else given
+    known = isinstance(sizes, (tuple, list)) and len(sizes) <= 32
+    if not known or not all(
+        isinstance(n, (int, np.integer)) and 0 <= n <= MAX_BYTES for n in sizes
+    ):
+        raise ValueError(f"{given!r} are not sizes")
+    return tuple(int(n) for n in sizes)
 
 
 def _chumpy_select(args: tuple, state: Any) -> np.ndarray:

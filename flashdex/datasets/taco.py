@@ -36,7 +36,7 @@ from flashdex.datasets.roots import relative, require_folders, scaled_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
-from flashdex.system.arrays import read_array
+from flashdex.system.archives import read_array
 
 NUM_POSE, NUM_BETAS = 48, 10
 FRAME = {"hand_pose": NUM_POSE, "hand_trans": 3}  # axis-angle, rad; wrist position, m

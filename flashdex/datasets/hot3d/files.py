@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flashdex.datasets.files import read_text, told
-from flashdex.errors import DemoError
+from flashdex.errors import DemoError, is_of_machine
 from flashdex.keys import SIDES, Side
 
 POSE_HEADER = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m]"
@@ -128,6 +128,8 @@ def read_lines(file: Path) -> list[str]:
             code="E_FILE",
         ) from error
     except (OSError, UnicodeDecodeError) as error:
+        if is_of_machine(error):
+            raise
         raise DemoError(f"{file}: not readable as text: {error}") from error
 
 

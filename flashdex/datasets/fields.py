@@ -12,6 +12,7 @@ from flashdex.datasets.tracks import continuous, missing_frames, to_quat
 from flashdex.errors import DemoError
 
 ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
+MAX_NUMBERS = 1 << 28  # of one entry of a file
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -29,6 +30,9 @@ def numbers(value: Any, *, what: str) -> np.ndarray:
         told = " ".join(str(error).split())[:120]
         text = f"{what}: not numbers but a {type(value).__name__}: {told}."
         raise DemoError(text, code="E_KEYS") from error
+    if array.size > MAX_NUMBERS:  # a view of few may say that it is many
+        text = f"{what}: {array.size} numbers; at most {MAX_NUMBERS} are read."
+        raise DemoError(text, code="E_KEYS")
     return array.astype(np.float64)
 
 

@@ -33,7 +33,10 @@ CACHE_VERSION = 2  # raise when the same mesh and settings give another asset
 MAX_VISUAL_FACES = 5000
 MAX_WORK_FACES = 32000  # more only cost time in CoACD and the winding number
 # what a torn, damaged or foreign file in the cache raises
-DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError)
+DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError),
+    RecursionError,
+)
 MAX_CACHED = 256 << 20  # bytes of an unpacked file of the cache
 
 Floats = NDArray[np.float32]

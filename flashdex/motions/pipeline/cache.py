@@ -104,10 +104,17 @@ def read_prepared(file: Path, root: Path) -> list[Prepared] | None:
         entries = json.loads(str(stored["entries"]))
         records = [_read_record(stored, i, e, root) for i, e in enumerate(entries)]
         pairs = zip(records, entries, strict=True)
-        return [Prepared(record, entry["row"]) for record, entry in pairs]
+        return [Prepared(record, _row_of(entry)) for record, entry in pairs]
     except DAMAGED as error:
         logger.warning("%s: unreadable (%s); preparing the motion again", file, error)
         return None
+
+
+def _row_of(entry: dict[str, Any]) -> dict[str, Any]:
+    row = entry["row"]
+    if not all(isinstance(row[key], str) for key in ("motion", "status", "reason")):
+        raise ValueError("a row without motion, status or reason")
+    return row
 
 
 def _read_record(

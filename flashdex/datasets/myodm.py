@@ -21,6 +21,7 @@ from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fetch import NOTE, myodm_dir
 from flashdex.datasets.fields import require
 from flashdex.datasets.files import load_npz, read_json
+from flashdex.datasets.roots import listed, on_disk
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 
@@ -152,7 +153,7 @@ def list_myodm(options: SourceOptions) -> list[Recording]:
     """Clips of the fetched folder, in name order."""
     root = options.path or myodm_dir()
     hand = root / "myohand_body.xml"
-    clips = sorted((root / "clips").glob("*.npz"))
+    clips = listed(root / "clips", "*.npz")
     if not clips or not hand.is_file():
         raise DemoError(
             f"{root}: no MyoDM recordings (clips/*.npz and myohand_body.xml). "
@@ -225,7 +226,7 @@ def _object_name(file: Path) -> str:
 
 
 def _mesh_file(clip: Path) -> Path:
-    return clip.parent.parent / "meshes" / f"{_object_name(clip)}.stl"
+    return on_disk(clip.parent.parent / "meshes" / f"{_object_name(clip)}.stl")
 
 
 def _origin(root: Path) -> dict[str, str]:

@@ -109,5 +109,8 @@ def _differs(
 
 def hash_content(path: Path) -> str:
     """SHA-256 of a file, read now."""
+    digest = hashlib.sha256()
     with open_plain(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

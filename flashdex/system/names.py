@@ -51,14 +51,14 @@ def check_names(names: Iterable[Any], *, what: str, where: str = "") -> list[str
     checked = [check_name(name, what=what, where=where) for name in names]
     seen: dict[str, str] = {}
     for name in checked:
-        # file systems that ignore case would take two for one
-        other = seen.setdefault(file_stem(name).casefold(), name)
-        if other is not name:
+        key = file_stem(name).casefold()  # some file systems ignore case
+        if key in seen:
             place = f"{where}: " if where else ""
             raise FlashdexError(
-                f"{place}two {what}s are called {other!a} and {name!a}; "
-                "their files would be the same. Rename one."
+                f"{place}two {what}s are called {seen[key]!a} and {name!a}; their "
+                "files would be the same. Rename one."
             )
+        seen[key] = name
     return checked
 
 

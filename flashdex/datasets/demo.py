@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
+from flashdex.datasets.roots import refuse_odd_name
 from flashdex.datasets.tracks import palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
@@ -88,6 +89,9 @@ class HumanDemo:
         With ``complete`` every frame must be tracked, and there must be enough of them;
         before repair, only what repair cannot mend counts.
         """
+        refuse_odd_name(self.name, what="motion")
+        for body in self.objects:
+            refuse_odd_name(body.name, what="object", where=self.name)
         if not self.keypoints:
             raise DemoError(
                 f"{self.name}: no hand. Give keypoints for 'left', 'right'."

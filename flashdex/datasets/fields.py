@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.tracks import continuous, missing_frames, to_quat
+from flashdex.datasets.tracks import blank_fillers, continuous, missing_frames, to_quat
 from flashdex.errors import DemoError
 
 ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
@@ -143,6 +143,7 @@ def poses_from_matrices(
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         text = f"{what}: shape {matrices.shape}; expected (T, 4, 4) transforms."
         raise DemoError(text, code="E_KEYS")
+    matrices = blank_fillers(matrices)
     seen = ~missing_frames(matrices)
     if not seen.any():
         return np.full((len(matrices), 7), np.nan), []

@@ -37,8 +37,8 @@ def check_name(name: Any, *, what: str, where: str = "") -> str:
         place = f"{where}: " if where else ""
         article = "an" if what[0] in "aeiou" else "a"
         raise FlashdexError(
-            f"{place}{shown} is no name of {article} {what}: {fault}. A name is one line of "
-            f"printable text of at most {NAME_BYTES} bytes, without / and \\."
+            f"{place}{shown} is no name of {article} {what}: {fault}. A name is one "
+            f"line of printable text of at most {NAME_BYTES} bytes, without / and \\."
         )
     return name
 

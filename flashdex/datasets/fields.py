@@ -66,10 +66,16 @@ def row(
 
 
 def words(value: Any) -> list[str]:
-    """All texts of an array of any rank, or of one that stands alone."""
+    """All texts of an array of any rank, or of one that stands alone.
+
+    Bytes are texts in UTF-8: numpy and HDF5 store them so.
+    """
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist()
-    return [str(v) for v in value] if isinstance(value, (list, tuple)) else [str(value)]
+    values = value if isinstance(value, (list, tuple)) else [value]
+    return [
+        v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values
+    ]
 
 
 def word(value: Any, *, what: str) -> str:

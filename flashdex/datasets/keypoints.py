@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fields import number, numbers
+from flashdex.datasets.fields import number, numbers, words
 from flashdex.datasets.files import load_npz, read_json, told
 from flashdex.datasets.roots import listed, on_disk, refuse_odd_name
 from flashdex.datasets.source import Recording, Source, SourceOptions
@@ -96,7 +96,7 @@ def read_file(file: Path) -> HumanDemo:
 
 def _read_objects(file: Path, data: dict) -> list[DemoObject]:
     """One object with ``obj_pose`` (T, 7), or several with (T, N, 7)."""
-    names = [str(name) for name in np.atleast_1d(data["object"])]
+    names = words(data["object"])
     poses = numbers(data["obj_pose"], what=f"{file}: obj_pose")
     if poses.ndim == 2:
         poses = poses[:, None]
@@ -119,8 +119,8 @@ def _mesh_file(file: Path, name: str) -> Path:
 def _mesh_files(file: Path) -> tuple[Path, ...]:
     """Meshes that a recording names; none where it cannot be read (yet)."""
     try:
-        names = np.atleast_1d(load_npz(file, only=["object"], plain=True)["object"])
-        meshes = [_mesh_file(file, str(name)) for name in names]
+        names = words(load_npz(file, only=["object"], plain=True)["object"])
+        meshes = [_mesh_file(file, name) for name in names]
         return tuple(mesh for mesh in meshes if mesh.is_file())
     except (OSError, KeyError, DemoError):
         return ()

@@ -130,12 +130,11 @@ def blank_fillers(track: np.ndarray) -> np.ndarray:
     """A track with NaN in frames that hold a mark in place of numbers.
 
     Data sets write zeros, or -1, or another number, where nothing was tracked: a frame
-    of poses (T, 7), transforms (T, 4, 4) or keypoints (T, 21, 3) whose points are all
-    one, whose entries are all one, or whose quaternion is zero. Tracks of other shapes
-    stay as they are.
+    of poses (T, 7), transforms (T, 4, 4) or keypoints (T, 21, 3) whose entries are all
+    the same, or whose quaternion is zero. Tracks of other shapes stay as they are.
     """
-    if track.ndim == 3 and len(track):  # rows of a transform, or points
-        spread = np.ptp(track, axis=1).max(axis=1)
+    if track.ndim == 3 and track.size:
+        spread = np.ptp(track, axis=(1, 2))
     elif track.ndim == 2 and track.shape[1] == 7 and len(track):
         no_turn = np.abs(track[:, 3:]).max(axis=1)
         spread = np.minimum(np.ptp(track, axis=1), no_turn)

@@ -17,7 +17,6 @@ from flashdex.datasets.demo import (
     MAX_SECONDS,
     MIN_SECONDS,
     QUAT_TOLERANCE,
-    DemoObject,
     HumanDemo,
 )
 from flashdex.datasets.support import demo_support
@@ -32,7 +31,6 @@ from flashdex.datasets.tracks import (
 )
 from flashdex.errors import MeshError
 from flashdex.keys import FINGERS, Side
-from flashdex.motions.contact.activity import has_moved
 from flashdex.motions.findings import Finding, info, reject, status_of, warn
 from flashdex.motions.repair.jumps import JUMP_EVENTS, outliers
 
@@ -75,38 +73,6 @@ def repair(
     return pieces, found + remarks
 
 
-def leave_out_bystanders(demo: HumanDemo) -> tuple[HumanDemo, list[Finding]]:
-    """Without objects that never move and whose mesh cannot be read.
-
-    Nothing is lost with them; an object that moves, that the recording says a hand
-    uses, or that is the only one, stays, and is refused where its mesh is needed.
-    """
-    if set(demo.palm) < set(demo.keypoints):
-        return demo, []  # of a wrong shape, which validation tells
-    used, kept, found = set(demo.hand_object.values()), [], []
-    for place, body in enumerate(demo.objects):
-        fault = _mesh_fault(body) if len(demo.objects) > 1 else ""
-        moves = body.pose.shape[1:] != (7,) or has_moved(body.pose)
-        if not fault or moves or place in used:
-            kept.append(place)
-            continue
-        text = f"object '{body.name}', which never moves, left out: {fault}"
-        found.append(warn("E_MESH", text))
-    return (
-        (demo, [])
-        if not found or not kept
-        else (keep(demo, [*demo.keypoints], kept), found)
-    )
-
-
-def _mesh_fault(body: DemoObject) -> str:
-    try:
-        body.load_mesh()
-    except MeshError as error:
-        return error.text
-    return ""
-
-
 def _blank(demo: HumanDemo) -> HumanDemo:
     """A copy in which a frame that lacks one value of a track lacks them all."""
     keypoints, palm = dict(demo.keypoints), dict(demo.palm)
@@ -126,8 +92,8 @@ def _tell_half_seen(demo: HumanDemo) -> list[Finding]:
     found = []
     for side, points in demo.keypoints.items():
         gone = np.asarray(~np.isfinite(points).all(axis=2))
-        half = gone.any(axis=1) & ~gone.all(axis=1)
-        if half.mean() <= HALF_SEEN:
+        half = np.asarray(gone.any(axis=1) & ~gone.all(axis=1))
+        if half.sum() <= HALF_SEEN * len(half):
             continue
         often = gone[half].mean(axis=0)
         usual = np.flatnonzero(often > 0.5 * often.max()).tolist()

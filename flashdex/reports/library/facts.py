@@ -44,6 +44,7 @@ CODES = {
     "I_SIGN": "quaternion signs that flipped were set right",
     "R_BELOW": "object more than 5 cm below the table",
     "W_HELD": "every frame stands several times: another rate",
+    "W_ORIGIN": "a mesh far from the origin of its frame was moved there",
     "E_SIDE": "fingers bend backwards: left and right swapped, or mirrored",
     "R_CONTACT": "the object moves, but no fingertip comes within 2 cm",
     "R_INACTIVE": "no hand touches an object, at all or for a time",

@@ -24,7 +24,6 @@ from flashdex.datasets.files import load_npz, read_bytes, read_json, told
 from flashdex.datasets.roots import listed, on_disk
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
-from flashdex.system.mjcf import ModelError, compile_mjcf
 
 if TYPE_CHECKING:
     import mujoco
@@ -73,6 +72,9 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _model(tree: Path) -> tuple[mujoco.MjModel, tuple[tuple[bool, int], ...]]:
+    # here: sources are listed without MuJoCo
+    from flashdex.system.mjcf import ModelError, compile_mjcf
+
     text = _read(tree)
     try:
         root = ET.fromstring(text)

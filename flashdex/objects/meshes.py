@@ -36,6 +36,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         )
     try:
         mesh = read_scene(path).to_mesh()
+        if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+            raise ValueError("not triangles of points in space")
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way

@@ -84,6 +84,8 @@ HOSTILE = {
     "off_polygon": ("a.off", f"OFF\n1 1 0\n0 0 0\n{MANY} 0 0 0\n".encode()),
     "obj_index": ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999999999999\n"),
     "obj_negative_index": ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -99999999\n"),
+    "obj_flat_points": ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n"),
+    "obj_lines": ("a.obj", b"v 0\nv 1\nv 2\nf 1 2 3\n"),
     "obj_nul": ("a.obj", bytes(5000)),
     "glb_zeros": ("a.glb", glb(zeros)),
     "glb_repeated": ("a.glb", glb(repeat)),

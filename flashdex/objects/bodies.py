@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from flashdex.objects.signed_distance import winding_number
 
@@ -118,7 +119,7 @@ def fault_of_mass(
     mass: float,
     com: NDArray[np.floating],
     inertia: NDArray[np.floating],
-    bounds: NDArray[np.floating],
+    corners: NDArray[np.floating],
 ) -> str:
     """What is impossible about the mass of a body; empty where nothing is.
 
@@ -126,15 +127,20 @@ def fault_of_mass(
         mass: kg.
         com: centre of mass, m, (3,).
         inertia: about it, kg m^2, (3, 3).
-        bounds: lower and upper corner of the body, m, (2, 3).
+        corners: of the body's hull, or the lower and upper one of its box, m, (V, 3).
     """
-    numbers = [np.ravel(mass), np.ravel(com), np.ravel(inertia), np.ravel(bounds)]
+    numbers = [np.ravel(mass), np.ravel(com), np.ravel(inertia), np.ravel(corners)]
     if not np.isfinite(np.concatenate(numbers)).all():
         return "its mass properties are not finite"
-    size = np.linalg.norm(bounds[1] - bounds[0])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    size = np.linalg.norm(high - low)
     if not mass > 0:
         return f"its mass is {mass:.3g} kg"
-    if ((com < bounds[0] - 1e-3 * size) | (com > bounds[1] + 1e-3 * size)).any():
+    outside = np.maximum(low - com, com - high).max()
+    if len(corners) > 2:
+        faces = ConvexHull(corners).equations
+        outside = (faces[:, :3] @ com + faces[:, 3]).max()
+    if outside > 1e-3 * size:
         return "its centre of mass lies outside of it"
     moments = np.linalg.eigvalsh(np.asarray(inertia, dtype=np.float64))
     if not moments[0] > 0 or moments[2] > (1 + 1e-3) * (moments[0] + moments[1]):

@@ -116,13 +116,14 @@ def compute_mass_properties(
     Raises:
         MeshError: not even the parts have such; ``name`` is for it.
     """
+    corners = np.asarray(mesh.convex_hull.vertices)
     if bounds_volume(mesh):
         found = _sum_of_solids([mesh], density, mass_limits)
-        if not fault_of_mass(*found, mesh.bounds):
+        if not fault_of_mass(*found, corners):
             return found
     hulls = [trimesh.convex.convex_hull(part) for part in parts]
     found = _sum_of_solids(hulls, density, mass_limits)
-    if fault := fault_of_mass(*found, mesh.bounds):
+    if fault := fault_of_mass(*found, corners):
         raise MeshError(f"{name}: {fault}. Are its triangles facing outward?")
     return found
 

@@ -126,6 +126,12 @@ def test_impossible_mass_is_told(mass, com, inertia, told):
     assert not fault_of_mass(1.0, np.zeros(3), np.eye(3), BOUNDS)
 
 
+def test_centre_outside_of_the_hull_but_inside_of_the_box_is_told():
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assert "outside" in fault_of_mass(1.0, np.full(3, 0.5), np.eye(3), corner)
+    assert not fault_of_mass(1.0, np.full(3, 0.2), np.eye(3), corner)
+
+
 def test_a_mesh_with_impossible_mass_takes_that_of_its_parts(monkeypatch):
     good = box(0.04, 0.05, 0.06)
     parts = [np.float32(good.vertices)]

@@ -171,7 +171,7 @@ def test_criteria_page_names_exactly_the_criteria():
 
 
 def test_data_page_names_exactly_the_frame_entries():
-    from flashdex.motions.library import FRAME_KEYS
+    from flashdex.motions.library_format import FRAME_KEYS
 
     assert set(FRAME_KEYS) == first_cells("data.md", "frames")
 
@@ -188,7 +188,7 @@ def test_data_page_names_exactly_the_codes_of_a_report():
 
 
 def test_data_page_names_exactly_the_quality_entries():
-    from flashdex.motions.library import QUALITY_KEYS
+    from flashdex.motions.library_format import QUALITY_KEYS
 
     assert set(QUALITY_KEYS) == first_cells("data.md", "quality")
 

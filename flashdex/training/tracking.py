@@ -18,7 +18,6 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.scene.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.modules.layers import restore_generator
@@ -105,11 +104,9 @@ class TrackingTask(Task):
         return hashlib.sha256(text.encode()).hexdigest()
 
     def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
-        """Score the baselines, anew where the recipe changed, and open the ledger."""
+        """Score the baselines, what is new of them, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)
-        if changed:
-            (run_dir / BASELINES).unlink(missing_ok=True)
         baselines = score_baselines(self.builder, run_dir / BASELINES)
         self.ledger = open_ledger(
             self.builder,
@@ -283,9 +280,8 @@ def open_ledger(
 def make_inline_scorer(spec: ScorerSpec) -> InlineScorer:
     """Build the scorer of the scoring process."""
     builder = RunBuilder.from_recipe(spec.recipe, device=torch.device("cpu"))
-    scenes = build_scenes(builder.library, builder.hands, spec.recipe.physics)
     rollouts = builder.rollout_builder(
-        scenes, made_by=spec.made_by, provenance=spec.provenance
+        builder.scenes, made_by=spec.made_by, provenance=spec.provenance
     )
     ledger = open_ledger(builder, spec.run_dir, spec.trivial, on_gpu=spec.on_gpu)
     return InlineScorer(ledger, rollouts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
+from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import Rollout
 
@@ -28,22 +30,25 @@ class RolloutBuilder:
     """Builds rollouts from recorded episodes, on the CPU, where ``bank`` must be.
 
     ``scenes`` has one a motion; ``made_by`` and ``provenance`` (hashes of recipe and
-    library, date) are stored with every rollout.
+    library, date, physics settings) are stored with every rollout; ``motion_hash``
+    gives the hash of a motion by its row.
     """
 
     def __init__(
         self,
         bank: ReferenceBank,
         hands: dict[keys.Side, HandSpec],
-        scenes: list[Scene],
+        scenes: Sequence[Scene] | Mapping[int, Scene],
         *,
         decimation: int,
         criterion: str,
         seed: int,
         made_by: dict[str, Any],
-        provenance: dict[str, str] | None = None,
+        provenance: dict[str, Any] | None = None,
+        motion_hash: Callable[[int], str] | None = None,
     ) -> None:
         self.bank, self.scenes = bank, scenes
+        self._provenance, self._motion_hash = provenance or {}, motion_hash
         self.kinematics = HandKinematics(hands)
         links, keypoints, bodies = [], [], []
         for side in keys.SIDES:
@@ -62,7 +67,6 @@ class RolloutBuilder:
             "criterion": criterion,
             "versions": json.dumps(made_by),
             "seed": seed,
-            "provenance": json.dumps(provenance or {}),
             "joint_bodies": json.dumps(bodies),
         }
 
@@ -103,6 +107,10 @@ class RolloutBuilder:
             env_steps=episode.env_steps,
             num_ref_frames=int(bank.length[motion]) - 1,
         )
+        bound = bindings_of(rollout)
+        if self._motion_hash is not None:
+            bound["motion_sha256"] = self._motion_hash(motion)
+        rollout.provenance = json.dumps({**self._provenance, **bound})
         rollout.terminations = [
             {"cause": name, "hand": side}
             for name, blamed in episode.causes.items()

@@ -74,6 +74,8 @@ def load_simulation(rollout: Rollout) -> Simulation:
     _check_sizes(model, rollout)
     adr = np.asarray(rollout.object_qpos_adr, dtype=np.int64)
     wrists = json.loads(rollout.wrist_bodies or "[null, null]")
+    if len(wrists) != 2 or not all(w is None or isinstance(w, str) for w in wrists):
+        raise RunError(f"{motion}: wrist_bodies must hold two names, or null.")
     active = rollout.hand_active.astype(bool)
     named = [n if on else None for n, on in zip(wrists, active, strict=True)]
     return Simulation(
@@ -92,7 +94,12 @@ def load_simulation(rollout: Rollout) -> Simulation:
 def _joint_bodies(model: mujoco.MjModel, rollout: Rollout) -> np.ndarray:
     links = json.loads(rollout.joint_bodies)
     count = rollout.joints.shape[2]
-    if len(links) != 2 or any(len(side) not in (0, count) for side in links):
+    if len(links) != 2 or not all(
+        isinstance(side, list)
+        and len(side) in (0, count)
+        and all(isinstance(name, str) for name in side)
+        for side in links
+    ):
         raise RunError(
             f"{rollout.motion}: joint_bodies must hold two lists (left, right) of "
             f"{count} body names, one a row of joints, or empty lists."

@@ -24,11 +24,19 @@ import numpy as np
 from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import numbers, part, poses_from_matrices, row, to_array
-from flashdex.datasets.files import load_pickle, refuse_clone, refuse_pointer, told
+from flashdex.datasets.files import (
+    load_pickle,
+    read_bytes,
+    read_text,
+    refuse_clone,
+    refuse_pointer,
+    told,
+)
 from flashdex.datasets.roots import relative, require_folders, scaled_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
+from flashdex.system.archives import read_array
 
 NUM_POSE, NUM_BETAS = 48, 10
 FRAME = {"hand_pose": NUM_POSE, "hand_trans": 3}  # axis-angle, rad; wrist position, m
@@ -187,7 +195,7 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
 def _load_matrices(file: Path) -> np.ndarray:
     fault = "not a .npy of (T, 4, 4) floats; pickled arrays are not read"
     with told(file, fault, code="E_KEYS"):
-        return numbers(np.load(file, allow_pickle=False), what=f"{file}: (T, 4, 4)")
+        return numbers(read_array(read_bytes(file)), what=f"{file}: (T, 4, 4)")
 
 
 def _common_length(
@@ -303,7 +311,7 @@ def _unique_names(folders: list[str]) -> list[str]:
 
 def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
     with told(file, "not a readable list of splits"):
-        lines = file.read_text(encoding="utf-8").split()
+        lines = read_text(file).split()
     matches = [SPLIT_LINE.fullmatch(line) for line in lines]
     splits = {match[1]: match[2] for match in matches if match}
     known = {Path(folder).name for folder in folders}

@@ -69,7 +69,7 @@ def _run_coacd(
             mcts_iterations=SEARCH_ITERATIONS,
             seed=seed,
         )
-    except (RuntimeError, OSError) as error:
+    except RuntimeError as error:
         logger.warning("%s: CoACD failed (%s); one convex hull instead", name, error)
         return []
     if len(parts) > max_parts:

@@ -10,13 +10,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
-from flashdex.errors import MeshError
+from flashdex.errors import MeshError, is_of_machine
+from flashdex.objects.mesh_files import MESH_SUFFIXES, read_scene
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
 MIN_PART_AREA = 0.01  # share of the area below which a loose component is dropped
-# others of trimesh unpack archives, or read what they name from other files
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
-MAX_FACES = 5_000_000  # a scene may hold the same geometry any number of times
 SAMPLES_PER_POINT = 64  # density of the sample that farthest points are chosen from
 
 
@@ -26,7 +24,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     Scenes become one mesh, each geometry moved by the transform of its node.
 
     Raises:
-        MeshError: the file is missing or cannot be read.
+        MeshError: the file is missing or is not such a mesh.
+        OSError, MemoryError: the machine fails, see ``is_of_machine``.
     """
     if not path.is_file():
         raise MeshError(f"{path}: mesh file not found. Check the path in the source.")
@@ -35,12 +34,12 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
             f"{path}: not readable as a mesh. Allowed: {', '.join(MESH_SUFFIXES)}."
         )
     try:
-        scene = trimesh.load_scene(path, process=False, skip_materials=True)
-        _refuse_large(scene)
-        mesh = scene.to_mesh()
+        mesh = read_scene(path).to_mesh()
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
+        if is_of_machine(error):
+            raise
         text = f"{path}: not readable as a mesh ({error}). Allowed: "
         raise MeshError(f"{text}{', '.join(MESH_SUFFIXES)}.") from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -48,13 +47,6 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
 
 def _joins_vertices(mesh: trimesh.Trimesh) -> bool:
     return mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
-
-
-def _refuse_large(scene: trimesh.Scene) -> None:
-    shapes = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-    faces = sum(len(getattr(scene.geometry[s], "faces", ())) for s in shapes)
-    if faces > MAX_FACES:
-        raise ValueError(f"{faces} triangles; at most {MAX_FACES}")
 
 
 def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:

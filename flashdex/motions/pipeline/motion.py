@@ -89,6 +89,7 @@ class Prepared:
 
     record: MotionRecord | None
     row: dict[str, Any]
+    passing: bool = False  # memory or a disk failed: another time it may go well
 
 
 def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
@@ -133,7 +134,8 @@ def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
         return make()
     except Exception as error:  # what no check foresaw must not end the others
         logger.debug("%s", name, exc_info=True)
-        return [rejected(name, [of_error(error)])]
+        item = rejected(name, [of_error(error)])
+        return [replace(item, passing=isinstance(error, OSError | MemoryError))]
 
 
 def rejected(name: str, findings: list[Finding]) -> Prepared:

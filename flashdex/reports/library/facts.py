@@ -29,6 +29,7 @@ CODES = {
     "E_FILE": "files that belong together are missing",
     "E_KEYS": "a key is missing or has a wrong shape",
     "E_LEN": "hands and objects have different numbers of frames",
+    "E_MACHINE": "memory or a disk failed; the same command tries it again",
     "E_MANO": "MANO files missing, wrong, or sides swapped",
     "E_MESH": "mesh missing, unreadable or without volume",
     "E_NAN": "frames not tracked: filled, cut around, or too many",

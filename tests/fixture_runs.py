@@ -25,6 +25,7 @@ TINY = {
     "future_latent": 8,
     "future_channels": [8, 8, 8],
 }
+CERTIFIED = {"certify": True, "render_conversions": False}
 
 
 @pytest.fixture
@@ -122,6 +123,28 @@ def start_tiny(library):
         return start(validate(recipe))
 
     return run
+
+
+@pytest.fixture(scope="session")
+def converted_run(start_tiny, tmp_path_factory):
+    """A finished run with certificates; ``copy_run`` gives one that may be spoilt."""
+    return start_tiny(tmp_path_factory.mktemp("converted") / "run", train=CERTIFIED)
+
+
+@pytest.fixture(scope="session")
+def truth(converted_run):
+    """Recipe and library of the converted run."""
+    from flashdex.training.loaded import open_truth
+
+    found, why = open_truth(converted_run)
+    assert found is not None, why
+    return found
+
+
+@pytest.fixture
+def spoilt_run(converted_run, tmp_path):
+    """A copy of the converted run, for a test to tamper with."""
+    return Path(shutil.copytree(converted_run, tmp_path / "run"))
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,8 @@ from flashdex.metrics.errors import position_error
 AUC_THRESHOLDS = tuple(k / 100 for k in range(1, 10))  # m
 PROBE = 0.05  # m, arm of the six body-fixed points of MPPE
 MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
+MIN_PATH = 0.02  # m, reference path below which the path ratio has no meaning
+PATH_HZ = 10.0  # of the positions that make a path: noise of single frames is no path
 
 
 def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Tensor:
@@ -77,6 +79,30 @@ def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
     rise = (pos[:, 2] - pos[0, 2]).max()
     ref_rise = (ref_pos[:, 2] - ref_pos[0, 2]).max()
     return float(rise / ref_rise) if ref_rise >= MIN_LIFT else None
+
+
+def path_ratio(pos: Tensor, ref_pos: Tensor, *, fps: float) -> float | None:
+    """Path length simulated over reference; None if the reference's is < 2 cm.
+
+    Positions are world, m, (T, 3), at ``fps``; every tenth of a second counts.
+    """
+    stride = max(1, round(fps / PATH_HZ))
+    rows = torch.arange(0, len(pos), stride)
+    if len(pos) and rows[-1] != len(pos) - 1:
+        rows = torch.cat([rows, torch.tensor([len(pos) - 1])])
+    path, ref = (object_path_length(x[rows]) for x in (pos, ref_pos))
+    return float(path / ref) if ref >= MIN_PATH else None
+
+
+def off_by(ratio: float | None) -> float:
+    """How far a ratio is from 1, up or down alike: 0.25 for 1.25 and for 0.8.
+
+    At most 999, for a ratio of zero; 0 where there is none.
+    """
+    if ratio is None:
+        return 0.0
+    ratio = max(ratio, 1e-3)
+    return max(ratio, 1 / ratio) - 1
 
 
 def smoothness(qvel: Tensor, *, fps: float) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 
 from flashdex.errors import RunError
 from flashdex.keys import SIDES
-from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria import score, worst_movement
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import TrackingErrors, compute_tracking_errors
 from flashdex.system.archives import read_npz
@@ -149,12 +149,17 @@ class Rollout:
         """What the ledger's line says of this attempt, scored by ``criterion``."""
         verdicts = self.score(completed=self.completed)
         verdict = verdicts[criterion]
+        ratios = worst_movement(self.tracking_errors())
         return {
             "motion": self.motion,
             "converted": verdict.is_passed,
             "certified": None,
             "criterion": criterion,
             "errors": {k: round(v, 6) for k, v in verdict.values.items()},
+            **{
+                f"{key}_ratio": None if ratio is None else round(ratio, 4)
+                for key, ratio in ratios.items()
+            },
             "passed": [name for name, v in verdicts.items() if v.is_passed],
             "completed": self.completed,
             "hands": [SIDES[hand] for hand in np.flatnonzero(self.hand_active)],

@@ -21,6 +21,7 @@ from flashdex.reports.run.facts import (
 )
 from flashdex.reports.run.report import write_report
 from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shorten
+from flashdex.rollouts.findings import Finding
 
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
@@ -167,6 +168,30 @@ def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> 
     word = "holds" if holds else "DOES NOT HOLD"
     name = shorten(motion, 40)
     return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
+
+
+def finding_lines(findings: Sequence[Finding], why: str = "") -> list[str]:
+    """Differences first, then what was not checked; alike ones of many files once.
+
+    ``why``: why there is no library to check against, or empty.
+    """
+    lines = [f"DIFFERS  {printable(f)}" for f in findings if f.is_fault]
+    unchecked: dict[str, int] = {}
+    for finding in findings:
+        if not finding.is_fault:
+            text = f"{finding.what}: {finding.text}"
+            unchecked[text] = unchecked.get(text, 0) + 1
+    if why and unchecked:
+        lines.append(f"not checked against a library: {printable(why)}")
+    return lines + [
+        f"not checked  {printable(text)}" + (f" ({count} times)" if count > 1 else "")
+        for text, count in unchecked.items()
+    ]
+
+
+def printable(value: object) -> str:
+    """One line of text that a terminal shows as it is."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(value))
 
 
 ROWS = 12  # newest evaluations shown

@@ -95,19 +95,19 @@ def collect():
 def start_tiny(library):
     """Train for 60 vector steps of 6 worlds in a folder; return it.
 
-    Takes ``train`` and ``logger`` settings, and fields of Recipe.
+    Takes ``train`` and ``logger`` settings, motions to select, and fields of Recipe.
     """
     from flashdex.recipe import LoggerConfig, MotionsConfig, validate
     from flashdex.training.run_dir import train as start
 
-    def run(folder, *, train=None, logger=None, **fields):
+    def run(folder, *, train=None, logger=None, select=None, **fields):
         transforms = {**EnvConfig().transforms, "object_points": {"num_points": 4}}
         settings = {"log_every_s": 0.2, "certify": False, "torch_threads": 1}
         settings |= {"stop_when_all_converted": False}
         recipe = dataclasses.replace(
             Recipe(name="tiny", total_env_steps=360),
             run_dir=str(folder),
-            motions=MotionsConfig(library=str(library.path)),
+            motions=MotionsConfig(library=str(library.path), select=select),
             physics=PhysicsConfig(num_threads=1),
             env=EnvConfig(
                 num_envs=6,
@@ -127,8 +127,15 @@ def start_tiny(library):
 
 @pytest.fixture(scope="session")
 def converted_run(start_tiny, tmp_path_factory):
-    """A finished run with certificates; ``copy_run`` gives one that may be spoilt."""
-    return start_tiny(tmp_path_factory.mktemp("converted") / "run", train=CERTIFIED)
+    """A finished run of one motion, with a certificate."""
+    folder = tmp_path_factory.mktemp("converted") / "run"
+    return start_tiny(folder, train=CERTIFIED, select=["right_box"])
+
+
+@pytest.fixture(scope="session")
+def converted_pair(start_tiny, tmp_path_factory):
+    """A finished run of several motions, with certificates."""
+    return start_tiny(tmp_path_factory.mktemp("pair") / "run", train=CERTIFIED)
 
 
 @pytest.fixture(scope="session")

@@ -26,6 +26,7 @@ from flashdex.system.names import check_name
 
 ROLLOUT_SCHEMA = 1
 MAX_BYTES = 256 << 20  # of the arrays of a file; a minute of two hands has 20 MB
+MAX_FPS, MAX_DECIMATION = 1000, 1000
 # JSON fields and what they hold
 _JSON: dict[str, type] = {
     "joint_bodies": list,
@@ -180,6 +181,11 @@ class Rollout:
                 _check_json(key, getattr(self, key), kind, where)
         check_name(self.motion, what="motion", where=where)
         check_name(self.hand, what="hand", where=where)
+        if not (0 < self.fps <= MAX_FPS and 1 <= self.decimation <= MAX_DECIMATION):
+            raise RunError(
+                f"{where}: {self.fps:g} control steps a second of {self.decimation} "
+                f"substeps. Allowed: up to {MAX_FPS} and {MAX_DECIMATION}."
+            )
         if self.model_sha256 != _sha256(self.model_xml):
             raise RunError(
                 f"{where}: model_sha256 does not match model_xml: the model was "

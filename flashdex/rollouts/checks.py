@@ -189,7 +189,11 @@ class RolloutCheck:
         try:
             hands = load_hand(r.hand)
         except FlashdexError:
-            self.skip("model", f"hand '{r.hand}' is not known here")
+            note = self.skip if settings is None else self.fault
+            note("hand", f"'{r.hand}' is not known here; install the package of it")
+        bodies = load_simulation(r, model).object_body
+        for name, text in implausible(model, bodies).items():
+            self.fault(f"model {name}", text)
         if settings is None or hands is None:
             return
         try:
@@ -199,9 +203,6 @@ class RolloutCheck:
             self.fault("model", f"is no scene of this hand ({error})")
             return
         self._compare(model, around, exact=False)
-        bodies = load_simulation(r, model).object_body
-        for name, text in implausible(model, bodies).items():
-            self.fault(f"model {name}", text)
         self.skip("model", f"shapes, masses and supports of objects: {NO_LIBRARY}")
 
     def _settings(self) -> PhysicsConfig | None:

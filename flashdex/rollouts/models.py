@@ -231,6 +231,8 @@ def implausible(model: mujoco.MjModel, object_body: np.ndarray) -> dict[str, str
         volume = sum(_hull_volume(model, int(m)) for m in mesh)
         size = float(model.geom_rbound[own].max(initial=0.0))
         density = mass / volume if volume > 0 else np.inf
+        if not len(own):
+            continue  # no object of ours; the comparison says so
         if not MASS[0] <= mass <= MASS[1]:
             found[f"{name} mass"] = f"is {mass:.3g} kg"
         elif not DENSITY[0] <= density <= DENSITY[1]:

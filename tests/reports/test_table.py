@@ -21,7 +21,10 @@ def row_of(text, name):
 
 def test_facts_of_a_run(run_dir, certificate):
     text = run_table(run_dir)
-    assert "1/5 converted by sr_mt_obj, 1 certified (1 robust), 1 trivial, 7" in text
+    assert (
+        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust), and 0 trivial, 7"
+        in text
+    )
     assert "16,000 env steps in 2 min 24 s" in text
     row = row_of(text, "push")
     depth = certificate.safety["penetration_max_mm"]
@@ -33,6 +36,8 @@ def test_facts_of_a_run(run_dir, certificate):
         "min": "1.5",
         "mm": "5.0",
         "deg": "2.0",
+        "lift": "-",
+        "path": "0.98",
         "proof": "robust",
         "pert": f"{certificate.perturbed['pass_fraction']['sr_mt_obj']:.0%}",
         "pen": f"{depth:.1f}",

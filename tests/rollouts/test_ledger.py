@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from flashdex.errors import RunError
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.ledger import CONVERSIONS, Ledger, read_lines
+from flashdex.rollouts.ledger import CONVERSIONS, Ledger
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.jsonl import read_lines, write_lines
 
 REQUIRED = {
     "motion": str,
@@ -164,7 +166,7 @@ def test_a_cut_off_last_line_costs_that_line_only(
 def test_a_broken_line_in_the_middle_is_an_error(tmp_path):
     path = tmp_path / "x.jsonl"
     path.write_text('{"a": 1}\n{"b":\n{"c": 2}\n')
-    with pytest.raises(ValueError, match="Expecting"):
+    with pytest.raises(RunError, match="line 2 is not JSON"):
         read_lines(path)
 
 
@@ -172,9 +174,8 @@ def test_lines_of_another_criterion_or_motion_do_not_count(tmp_path, library, pa
     record(open_ledger(tmp_path, library), passing, env_steps=10, wall_s=2.0)
     strict = open_ledger(tmp_path, library, criterion="sr_mt_obj_x0.5")
     assert strict.num_converted == 0
-    (tmp_path / CONVERSIONS).write_text(
-        (tmp_path / CONVERSIONS).read_text().replace("right_box", "left_out")
-    )
+    lines = read_lines(tmp_path / CONVERSIONS)
+    write_lines(tmp_path / CONVERSIONS, [x | {"motion": "left_out"} for x in lines])
     assert open_ledger(tmp_path, library).num_converted == 0
 
 

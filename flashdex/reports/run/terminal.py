@@ -25,6 +25,7 @@ from flashdex.rollouts.findings import Finding
 
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
+RATIOS = ("lift", "path")
 STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
 
 
@@ -47,9 +48,9 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  {_progress(run)}",
-        f"{counts['converted']}/{num_motions(run, rows)} converted by {run.criterion}, "
-        f"{counts['certified']} certified ({counts['robust']} robust), "
-        f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
+        f"{counts['converted']} of {num_motions(run, rows)} converted by "
+        f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust),"
+        f" and {counts['trivial']} trivial, {counts['attempts']:,} attempts",
     ]
 
 
@@ -69,6 +70,7 @@ def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
         "min": plain(first["wall_s"] / 60) if first else "-",
         "mm": _error(row.errors, "object_pos"),
         "deg": _error(row.errors, "object_rot"),
+        **{name: plain(r, 2) for name, r in zip(RATIOS, row.ratios, strict=True)},
         "proof": row.verdict or "-",
         "pert": "-" if share is None else f"{share:.0%}",
         "pen": plain(depth),
@@ -106,10 +108,12 @@ def _legend(run: RunData) -> list[str]:
         f"limits of {run.criterion}: {', '.join(limits) or 'none'}",
         "pert: share of perturbed replays that pass; pen: deepest contact, mm; "
         "N: largest force",
+        "lift, path: rise and path of the object over those of the recording",
     ]
     if run.baselines:
         lines.append(
-            "idle, playback: baselines without learning, mm/deg; *: one passes"
+            "idle, playback: baselines without learning, mm/deg; *: one passes, or the "
+            "object hardly moves"
         )
     return lines
 

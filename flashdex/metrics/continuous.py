@@ -14,8 +14,8 @@ from flashdex.metrics.errors import position_error
 AUC_THRESHOLDS = tuple(k / 100 for k in range(1, 10))  # m
 PROBE = 0.05  # m, arm of the six body-fixed points of MPPE
 MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
-MIN_PATH = 0.02  # m, reference path below which the path ratio has no meaning
-PATH_HZ = 10.0  # of the positions that make a path: noise of single frames is no path
+MIN_PATH = 0.03  # m, reference path below which the path ratio has no meaning
+RULER = 0.01  # m, by which a path is measured: noise at rest is no path
 
 
 def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Tensor:
@@ -81,17 +81,31 @@ def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
     return float(rise / ref_rise) if ref_rise >= MIN_LIFT else None
 
 
-def path_ratio(pos: Tensor, ref_pos: Tensor, *, fps: float) -> float | None:
-    """Path length simulated over reference; None if the reference's is < 2 cm.
+def ruler_path(pos: Tensor) -> float:
+    """Path of positions (T, 3), m, by steps of a centimetre.
 
-    Positions are world, m, (T, 3), at ``fps``; every tenth of a second counts.
+    The ruler is laid on where the position has left its last end by its length; what
+    trembles nearer to it does not count.
     """
-    stride = max(1, round(fps / PATH_HZ))
-    rows = torch.arange(0, len(pos), stride)
-    if len(pos) and rows[-1] != len(pos) - 1:
-        rows = torch.cat([rows, torch.tensor([len(pos) - 1])])
-    path, ref = (object_path_length(x[rows]) for x in (pos, ref_pos))
-    return float(path / ref) if ref >= MIN_PATH else None
+    points = pos.detach().cpu().double().numpy()
+    length, first = 0.0, 0
+    while first < len(points) - 1:
+        gap = np.linalg.norm(points[first + 1 :] - points[first], axis=1)
+        beyond = np.flatnonzero(gap >= RULER)
+        if not len(beyond):
+            return length + float(gap[-1])
+        length += float(gap[beyond[0]])
+        first += 1 + int(beyond[0])
+    return length
+
+
+def path_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
+    """Path simulated over reference; None if the reference's is shorter than 3 cm.
+
+    Positions are world, m, (T, 3); see ``ruler_path``.
+    """
+    ref = ruler_path(ref_pos)
+    return ruler_path(pos) / ref if ref >= MIN_PATH else None
 
 
 def off_by(ratio: float | None) -> float:

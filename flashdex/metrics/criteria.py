@@ -41,7 +41,7 @@ def movement(errors: TrackingErrors, slot: int) -> dict[str, float | None]:
     track = errors.object_track(slot)
     if track is None or len(track[0]) == 0:
         return {"lift": None, "path": None}
-    return {"lift": lift_ratio(*track), "path": path_ratio(*track, fps=errors.fps)}
+    return {"lift": lift_ratio(*track), "path": path_ratio(*track)}
 
 
 def worst_movement(errors: TrackingErrors) -> dict[str, float | None]:

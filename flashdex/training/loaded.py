@@ -16,9 +16,10 @@ from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
-from flashdex.rollouts.ledger import CONVERSIONS
+from flashdex.rollouts.ledger import CONVERSIONS, LINE, rollout_name
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
+from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_lines
 from flashdex.training.build import RunBuilder
 from flashdex.training.logging import METRICS
@@ -91,7 +92,7 @@ class Run:
     @cached_property
     def attempts(self) -> list[dict[str, Any]]:
         """Lines of ``conversions.jsonl``, one an attempt."""
-        return read_lines(self.path / CONVERSIONS)
+        return read_lines(self.path / CONVERSIONS, LINE)
 
     @cached_property
     def metrics(self) -> list[dict[str, Any]]:
@@ -112,7 +113,7 @@ class Run:
         if motion not in self.converted:
             known = ", ".join(self.converted) or "none"
             raise RunError(f"{self.path}: no rollout of '{motion}'. Stored: {known}.")
-        return Rollout.load(self.path / self.converted[motion]["rollout"])
+        return Rollout.load(own_file(self.path, rollout_name(motion)))
 
     def policy(self) -> RunPolicy:
         """The newest policy."""

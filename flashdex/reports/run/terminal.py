@@ -123,17 +123,20 @@ def evaluation_table(
 ) -> str:
     """Scores of ``flashdex evaluate`` for a terminal.
 
-    Rows, one a motion, hold name, state of each criterion, errors in m and rad; the
-    totals hold counts of each criterion and mean errors.
+    Rows, one a motion, hold name, state of each criterion, mean object errors in mm and
+    rad, and ratios of movement; the totals hold counts of each criterion, and the means
+    of these errors.
     """
     names = [key for key, value in totals.items() if isinstance(value, Mapping)]
-    cells = [["motion", *names, "mm", "deg"]]
+    cells = [["motion", *names, "mm", "deg", *RATIOS]]
     for row in rows:
-        errors = [_error(row["errors"], q) for q in ("object_pos", "object_rot")]
+        errors = plain(row["mope"]), plain(in_unit("object_rot", row["more"]))
         states = [STATES.get(row[name], str(row[name])) for name in names]
-        cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors])
+        ratios = [plain(row[f"{name}_ratio"], 2) for name in RATIOS]
+        cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors, *ratios])
     counts = [_rate(totals[name]) for name in names]
-    cells.append([f"all {len(rows)}", *counts, "", ""])
+    means = plain(totals["mope_all"]), plain(in_unit("object_rot", totals["more_all"]))
+    cells.append([f"all {len(rows)}", *counts, *means, "", ""])
     head = f"policy of {totals.get('env_steps', 0):,} env steps"
     notes = [*_means(totals), "n.m.: not measured on this motion"]
     return "\n".join([head, "", *align(cells), "", *notes])
@@ -157,6 +160,8 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
     """Every criterion of a stored rollout, with the numbers that were compared."""
     cells = [["criterion", "state", "values against limits"]]
     for verdict in verdicts.values():
+        if verdict.name.startswith("completed") and not verdict.is_passed:
+            continue  # no file says how the episode ended
         parts = [
             f"{SHOWN[q][0]} {plain(in_unit(q, value))}/"
             f"{in_unit(q, verdict.limits[q]):g} {SHOWN[q][1]}"

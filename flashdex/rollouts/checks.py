@@ -167,20 +167,20 @@ class RolloutCheck:
         r = self.rollout
         where = f"{self.file}: model_xml"
         truth = self.truth if self.is_current else None
-        if truth is not None and r.motion in truth.bank.names:
-            scene = truth.scene(r.motion, nodes=0)
-            if r.model_xml != scene.xml:
-                stored = compile_mjcf(r.model_xml, where=where)
-                scene = truth.scene(r.motion, nodes=stored.nbvh)
-            if r.model_xml == scene.xml:
-                self.model = scene.model
-                return
-            exact = self._versions.get("mujoco") == mujoco.__version__
-            self._compare(stored, scene.model, exact=exact)
-            self.model = stored
+        if truth is None or r.motion not in truth.bank.names:
+            self.model = compile_mjcf(r.model_xml, where=where)
+            self._model_alone(self.model)
             return
+        scene = truth.scene(r.motion, nodes=0)
+        if r.model_xml == scene.xml:
+            self.model = scene.model
+            return
+        # of a collection of several scenes, padded to the largest
         self.model = compile_mjcf(r.model_xml, where=where)
-        self._model_alone(self.model)
+        scene = truth.scene(r.motion, nodes=self.model.nbvh)
+        if r.model_xml != scene.xml:
+            exact = self._versions.get("mujoco") == mujoco.__version__
+            self._compare(self.model, scene.model, exact=exact)
 
     def _model_alone(self, model: mujoco.MjModel) -> None:
         """Without library: everything but shapes, masses and supports."""

@@ -119,8 +119,12 @@ class Ledger:
         }
         before = self.conversions.get(name)
         # One lucky draw is not the last word: later passes may still be proven.
-        unproven = before is None or (self.certify and not before["certified"])
-        if line["converted"] and (unproven or _is_more(line, before)):
+        is_wanted = (
+            before is None
+            or (self.certify and not before["certified"])
+            or _is_more(line, before)
+        )
+        if line["converted"] and is_wanted:
             line.update(self._store(rollout, line["errors"], is_own=is_own))
         append_line(self.path, line)
         return line, self.count(line)

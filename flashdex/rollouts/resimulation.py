@@ -62,7 +62,7 @@ class Replay:
 
 
 def load_simulation(
-    rollout: Rollout, model: mujoco.MjModel | None = None
+    rollout: Rollout, given: mujoco.MjModel | None = None
 ) -> Simulation:
     """Find the parts of a rollout in its model, which is compiled where None is given.
 
@@ -71,8 +71,8 @@ def load_simulation(
             in it.
     """
     motion = rollout.motion
-    given = model is not None
-    model = copy.copy(model) if given else compile_mjcf(rollout.model_xml, where=motion)
+    own = given or compile_mjcf(rollout.model_xml, where=motion)
+    model: mujoco.MjModel = copy.deepcopy(own)
     model.opt.iterations = max(model.opt.iterations, MIN_ITERATIONS)
     model.opt.ls_iterations = max(model.opt.ls_iterations, MIN_LS_ITERATIONS)
     # a diverged state must stay visible instead of being reset

@@ -291,7 +291,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return data
 
 
-def _field(key: str, value: np.ndarray, hint: Any, path: Path) -> Any:
+def _field(key: str, value: np.ndarray, hint: Any, path: str | Path) -> Any:
     """An array of numbers as it is, or one text or number of it."""
     is_array = get_origin(hint) is Annotated
     kinds = {str: "U", int: "iu", float: "fiu"}.get(hint, "fiub")

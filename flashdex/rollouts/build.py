@@ -26,6 +26,16 @@ def grace_steps(fps: float) -> int:
     return round(GRACE_S * fps)
 
 
+def link_names(hands: dict[keys.Side, HandSpec]) -> str:
+    """Names of the bodies behind ``joints`` of a rollout, JSON, both hands."""
+    return json.dumps(
+        [
+            [hand.link_names[i] for i, _ in [*hand.level1_links, *hand.distal_links]]
+            for hand in (hands[side] for side in keys.SIDES)
+        ]
+    )
+
+
 class RolloutBuilder:
     """Builds rollouts from recorded episodes, on the CPU, where ``bank`` must be.
 
@@ -50,13 +60,12 @@ class RolloutBuilder:
         self.bank, self.scenes = bank, scenes
         self._provenance, self._motion_hash = provenance or {}, motion_hash
         self.kinematics = HandKinematics(hands)
-        links, keypoints, bodies = [], [], []
+        links, keypoints = [], []
         for side in keys.SIDES:
             hand = hands[side]
             pairs = [*hand.level1_links, *hand.distal_links]
             links.append([link for link, _ in pairs])
             keypoints.append([hand.keypoint_links.index(pair) for pair in pairs])
-            bodies.append([hand.link_names[link] for link, _ in pairs])
         # (2, M): links of ``joints``, and the rows of their human keypoints
         self._links, self._keypoints = torch.tensor(links), torch.tensor(keypoints)
         self._of_run: dict[str, Any] = {
@@ -67,7 +76,7 @@ class RolloutBuilder:
             "criterion": criterion,
             "versions": json.dumps(made_by),
             "seed": seed,
-            "joint_bodies": json.dumps(bodies),
+            "joint_bodies": link_names(hands),
         }
 
     def build(self, episode: Episode) -> Rollout:

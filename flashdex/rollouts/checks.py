@@ -19,7 +19,7 @@ from flashdex.errors import FlashdexError
 from flashdex.hands.spec import load_hand
 from flashdex.metrics.criteria_table import resolve_criterion
 from flashdex.rollouts.bindings import bindings_of
-from flashdex.rollouts.build import grace_steps
+from flashdex.rollouts.build import grace_steps, link_names
 from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
 from flashdex.rollouts.findings import Finding, differences, short
 from flashdex.rollouts.models import compare_models, implausible, rebuild_around
@@ -42,6 +42,8 @@ ALIKE = 1e-4  # of float32 numbers that another engine computed
 POINTS = 1e-5  # m; stored points come from float32 kinematics
 UNIT = 1e-4  # of the length of a quaternion
 IMPACTS = 0.05  # share of steps that another engine may resolve differently
+# of numbers that stand where a scene has others
+_UNFIT = (ValueError, KeyError, TypeError, IndexError, OverflowError)
 MAX_SUBSTEPS = 1_000_000  # of a file that says itself how many; an hour at 60 Hz
 # of the file alone: no library says them, hashes bind them
 _UNBOUND = {"provenance", "versions", "errors", "env_steps", "model_xml"}
@@ -181,6 +183,9 @@ class RolloutCheck:
         if r.model_xml != scene.xml:
             exact = self._versions.get("mujoco") == mujoco.__version__
             self._compare(self.model, scene.model, exact=exact)
+        bodies = load_simulation(r, scene.model).object_body
+        for name, text in implausible(scene.model, bodies).items():
+            self.skip(f"model {name}", f"{text}, by recipe and library themselves")
 
     def _model_alone(self, model: mujoco.MjModel) -> None:
         """Without library: everything but shapes, masses and supports."""
@@ -199,9 +204,11 @@ class RolloutCheck:
         try:
             slots = np.asarray(r.hand_object).tolist()
             around = rebuild_around(r.model_xml, model, hands, settings, slots)
-        except (ValueError, KeyError, TypeError, IndexError) as error:
+        except (*_UNFIT, mujoco.FatalError) as error:
             self.fault("model", f"is no scene of this hand ({error})")
             return
+        if r.joint_bodies != link_names(hands):
+            self.fault("joint_bodies", "are not the links of this hand")
         self._compare(model, around, exact=False)
         self.skip("model", f"shapes, masses and supports of objects: {NO_LIBRARY}")
 
@@ -219,7 +226,7 @@ class RolloutCheck:
         except TypeError as error:
             self.fault("physics", f"are no settings ({error})")
             return None
-        if settings.decimation != self.rollout.decimation or abs(step - 1) > 1e-3:
+        if settings.decimation != self.rollout.decimation or not abs(step - 1) < 1e-3:
             self.fault("physics", f"{step:.3g} control steps in one")
         return settings
 
@@ -304,7 +311,7 @@ class RolloutCheck:
         """Field by field against the rollout that recipe and library give."""
         r, truth = self.rollout, self.truth
         if truth is None:
-            self.skip("reference, first state, actions, criterion", NO_LIBRARY)
+            self.skip("roles, reference, first state, actions, criterion", NO_LIBRARY)
             return
         if r.motion not in truth.bank.names:
             self.fault("motion", f"'{r.motion}' is none of the run's")

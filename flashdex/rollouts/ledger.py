@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from flashdex.rollouts.rollout import Rollout
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
-from flashdex.system.names import check_names, file_stem
+from flashdex.system.names import check_name, check_names, file_stem
 
 _LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"
@@ -32,11 +33,41 @@ LINE: dict[str, type | tuple[type, ...]] = {
     "env_steps": int,
     "wall_s": float,
 }
+# what newer versions, or only some lines, hold besides; null stands for nothing
+_MORE: dict[str, type] = {
+    **dict.fromkeys(("passed", "hands", "why", "trivial"), list),
+    **dict.fromkeys(("rollout", "verdict", "engine"), str),
+    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), str),
+    **dict.fromkeys(("certified", "completed"), bool),
+    **dict.fromkeys(("frame", "seed"), int),
+}
+
+
+def read_ledger(path: Path) -> list[dict[str, Any]]:
+    """The lines of ``conversions.jsonl``.
+
+    Raises:
+        RunError: one is no line of a ledger, or was changed; it is named.
+    """
+    lines = read_lines(path, LINE)
+    for number, line in enumerate(lines, start=1):
+        where = f"{path}: line {number}"
+        check_name(line["motion"], what="motion", where=where)
+        if not math.isfinite(line["wall_s"]):
+            raise RunError(f"{where} has {line['wall_s']} as 'wall_s'.")
+        for key, kind in _MORE.items():
+            value = line.get(key)
+            if value is not None and type(value) is not kind:
+                raise RunError(
+                    f"{where} has {value!r:.60} as '{key}'. flashdex only adds lines "
+                    "to this file; restore it from a copy."
+                )
+    return lines
 
 
 def rollout_name(motion: str) -> str:
     """Where a run keeps the rollout of a motion: the only place a line may name."""
-    return f"{ROLLOUTS}/{file_stem(motion)}.npz"
+    return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
 
 
 def certificate_name(motion: str) -> str:
@@ -88,7 +119,7 @@ class Ledger:
         self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
         self.attempts: dict[str, int] = dict.fromkeys(names, 0)  # motion -> lines
         drop_cut_line(self.path)
-        for line in read_lines(self.path, LINE):  # of earlier sessions
+        for line in read_ledger(self.path):  # of earlier sessions
             # A resume may ask for another criterion, or for fewer motions.
             if line["criterion"] == criterion and line["motion"] in names:
                 self.count(line)
@@ -185,7 +216,7 @@ class Ledger:
         damaged, stays where it is, without a line; a later conversion replaces it.
         Returns the motions told of.
         """
-        told = {x["motion"]: x for x in read_lines(self.path, LINE) if x.get("rollout")}
+        told = {x["motion"]: x for x in read_ledger(self.path) if x.get("rollout")}
         out = []
         for name in self.names:
             path = own_file(self.run_dir, rollout_name(name))

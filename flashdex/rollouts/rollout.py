@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria import score, worst_movement
 from flashdex.metrics.criteria_table import Verdict
@@ -26,6 +26,7 @@ from flashdex.system.names import check_name
 
 ROLLOUT_SCHEMA = 1
 MAX_BYTES = 256 << 20  # of the arrays of a file; a minute of two hands has 20 MB
+_WHOLE = ("hand_active", "hand_object", "object_qpos_adr", "object_qvel_adr")
 MAX_FPS, MAX_DECIMATION = 1000, 1000
 # JSON fields and what they hold
 _JSON: dict[str, type] = {
@@ -191,8 +192,8 @@ class Rollout:
                 f"{where}: model_sha256 does not match model_xml: the model was "
                 "changed after the rollout was stored. Store the rollout again."
             )
-        slots = self.hand_object[self.hand_active.astype(bool)]
-        if (slots >= sizes["O"]).any():
+        slots = self.hand_object
+        if (slots >= max(1, sizes["O"])).any():
             raise RunError(
                 f"{where}: hand_object {slots.tolist()} names a slot beyond the "
                 f"{sizes['O']} objects of object_pos. Allowed: -1 to {sizes['O'] - 1}."
@@ -246,7 +247,7 @@ class Rollout:
         }
         try:
             return cls(**values)
-        except RunError as error:
+        except FlashdexError as error:
             raise RunError(str(error).replace("rollout:", f"{path}:", 1)) from None
 
 
@@ -295,6 +296,7 @@ def _field(key: str, value: np.ndarray, hint: Any, path: str | Path) -> Any:
     """An array of numbers as it is, or one text or number of it."""
     is_array = get_origin(hint) is Annotated
     kinds = {str: "U", int: "iu", float: "fiu"}.get(hint, "fiub")
+    kinds = "iub" if key in _WHOLE else kinds  # these index others
     if value.dtype.kind not in kinds or (not is_array and value.shape != ()):
         raise RunError(
             f"{path}: {key} holds {value.dtype} {value.shape}, which is not what a "

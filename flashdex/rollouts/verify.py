@@ -18,7 +18,13 @@ from flashdex.metrics.criteria import criterion_names, moves_too_little
 from flashdex.rollouts.certificate import CERTIFICATE_SCHEMA, PROVEN, certify
 from flashdex.rollouts.checks import OLD, RolloutCheck
 from flashdex.rollouts.findings import Finding, differences, short
-from flashdex.rollouts.ledger import CONVERSIONS, LINE, ROLLOUTS, UNMOVED, rollout_name
+from flashdex.rollouts.ledger import (
+    CONVERSIONS,
+    ROLLOUTS,
+    UNMOVED,
+    read_ledger,
+    rollout_name,
+)
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth, library_hashes
 from flashdex.system.arrays import hash_content
@@ -134,8 +140,8 @@ class _RunCheck:
     def _lines(self) -> list[dict[str, Any]]:
         """Lines of the ledger; one that is not as it was written ends the list."""
         try:
-            lines = read_lines(own_file(self.run_dir, CONVERSIONS), LINE)
-        except RunError as error:
+            lines = read_ledger(own_file(self.run_dir, CONVERSIONS))
+        except FlashdexError as error:
             self.fault("lines", str(error))
             return []
         attempts, wall_s = self._attempts(), 0.0
@@ -149,7 +155,21 @@ class _RunCheck:
                 self.fault(where, "is out of order: its wall_s is below the one before")
             wall_s = line["wall_s"]
             self._line(where, line)
+        self._proofs(lines)
         return lines
+
+    def _proofs(self, lines: list[dict[str, Any]]) -> None:
+        """A motion is converted by the line that stores its first pass."""
+        kept: set[tuple[str, str]] = set()
+        for number, line in enumerate(lines, start=1):
+            key = (line["motion"], line["criterion"])
+            if line.get("rollout"):
+                kept.add(key)
+            elif line.get("certified") or line.get("verdict"):
+                self.fault(f"line {number}", "is certified, but names no rollout")
+            elif line["converted"] and key not in kept:
+                text = "is the motion's first conversion, but names no rollout"
+                self.fault(f"line {number}", text)
 
     def _attempts(self) -> int:
         """Attempts that the last record of the metrics counts."""

@@ -16,7 +16,7 @@ from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
-from flashdex.rollouts.ledger import CONVERSIONS, LINE, rollout_name
+from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.files import own_file
@@ -92,7 +92,7 @@ class Run:
     @cached_property
     def attempts(self) -> list[dict[str, Any]]:
         """Lines of ``conversions.jsonl``, one an attempt."""
-        return read_lines(self.path / CONVERSIONS, LINE)
+        return read_ledger(self.path / CONVERSIONS)
 
     @cached_property
     def metrics(self) -> list[dict[str, Any]]:

@@ -43,7 +43,7 @@ def test_replay_without_the_library_says_what_was_not_checked(call, spoilt_run):
     assert code == 1  # the recipe was changed
     assert "DIFFERS  rollouts/right_box.npz: recipe" in out
     assert "not checked against a library: " in out
-    assert "not checked  reference, first state, actions, criterion" in out
+    assert "not checked  roles, reference, first state, actions, criterion" in out
 
 
 def test_replay_of_tampered_controls_is_one(call, spoilt_run):
@@ -72,7 +72,7 @@ def test_replay_of_an_embellished_certificate_is_one(call, spoilt_run):
 def test_score_says_what_it_did_not_check(call, converted_run):
     code, out, _ = call("score", converted_run / "rollouts" / "right_box.npz")
     assert code == 0
-    assert "not checked  reference, first state, actions, criterion" in out
+    assert "not checked  roles, reference, first state, actions, criterion" in out
 
 
 def test_score_refuses_what_replay_would_refuse(call, spoilt_run):

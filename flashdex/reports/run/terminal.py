@@ -175,8 +175,9 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
 def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> str:
     """One replayed rollout: its verdict in the run's files, and of the replay."""
     word = "holds" if holds else "DOES NOT HOLD"
-    name = shorten(motion, 40)
-    return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
+    name = shorten(printable(motion), 40)
+    stored = printable(stored or "none")
+    return f"{name:<40}  stored {stored:<12}  found {found:<12}  {word}"
 
 
 def finding_lines(findings: Sequence[Finding], why: str = "") -> list[str]:

@@ -135,7 +135,8 @@ def test_run_page_names_exactly_the_keys_of_an_attempt(tiny_run):
     lines = read_rows(tiny_run / "conversions.jsonl")
     assert lines
     keys = {key for line in lines for key in line}
-    stored = {"rollout", "verdict"}  # of conversions only
+    # of conversions only
+    stored = {"rollout", "verdict", "rollout_sha256", "certificate_sha256"}
     assert keys | stored == first_cells("runs.md", "conversions.jsonl")
 
 

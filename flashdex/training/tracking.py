@@ -26,6 +26,7 @@ from flashdex.replay.buffer import check_pinning
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, ScorerSpec
+from flashdex.rollouts.truth import library_hashes
 from flashdex.system.machine import versions
 from flashdex.training.baselines import score_baselines
 from flashdex.training.build import RunBuilder, learner_device
@@ -81,11 +82,10 @@ class TrackingTask(Task):
     @cached_property
     def provenance(self) -> dict[str, str]:
         """Where a rollout comes from, apart from the versions stored with it."""
-        manifest = (self.builder.library.path / "manifest.json").read_bytes()
         recipe = dump_recipe(self.recipe).encode()
         return {
             "recipe_sha256": hashlib.sha256(recipe).hexdigest(),
-            "library_sha256": hashlib.sha256(manifest).hexdigest(),
+            "library_sha256": library_hashes(self.builder.library)[0],
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
 
@@ -196,7 +196,7 @@ class TrackingTask(Task):
 
     def end_reason(self) -> str:
         """``all converted``, when that ends the run."""
-        everything = self.ledger.num_converted == len(self.ledger.names)
+        everything = self.ledger.num_passed == len(self.ledger.names)
         stops = self.recipe.train.stop_when_all_converted
         return "all converted" if stops and everything else ""
 

@@ -19,8 +19,9 @@ from gym_runs import read_metrics, tiny_recipe, trainer_of
 from flashdex.cli.main import main
 from flashdex.errors import FlashdexError, RunError
 from flashdex.system.files import LOCK, run_lock
+from flashdex.system.run_files import DUMP
 from flashdex.training.checkpoint import newest_checkpoint
-from flashdex.training.guard import DUMP, GradientGuard, NonFiniteError
+from flashdex.training.guard import GradientGuard, NonFiniteError
 from flashdex.training.gym import SEED_OFFSET
 from flashdex.training.run_dir import evaluate, reopen, resume, train
 from flashdex.training.session import ended_by

@@ -1,7 +1,6 @@
 """Metric writers: what goes in comes out of every file, W&B's offline run included."""
 
 import csv
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from flashdex.recipe import LoggerConfig, Recipe
+from flashdex.system.jsonl import read_lines
 from flashdex.training.logging import MetricLog
 
 RECORDS = [
@@ -28,8 +28,7 @@ def write_records(run_dir: Path, **logger) -> MetricLog:
 
 def test_json_lines_are_written_whatever_the_recipe_names(tmp_path):
     write_records(tmp_path, kind=["csv"])
-    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == RECORDS
+    assert read_lines(tmp_path / "metrics.jsonl") == RECORDS
     with (tmp_path / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(r["convert/cumulative"]) for r in rows] == [0.0, 2.0]
@@ -46,10 +45,9 @@ def test_csv_keeps_its_columns_after_a_resume(tmp_path):
 def test_wandb_offline_run_holds_the_records(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     log = write_records(tmp_path, kind=["wandb"], wandb_mode="offline")
-    assert log.wandb_id
+    assert log.wandb_id is None  # a sync of a second session would replace this one
     files = list(tmp_path.glob("wandb/offline-run-*/run-*.wandb"))
     assert len(files) == 1
-    assert log.wandb_id in files[0].name
     # the store is binary; keys of the history stand in it as text. W&B's own process
     # writes it and may still be at it.
     end = time.monotonic() + 30
@@ -74,5 +72,4 @@ def test_a_line_that_a_crash_cut_off_is_removed(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text(path.read_text() + '{"env_steps": 14')
     write_records(tmp_path, kind=["jsonl"])
-    lines = path.read_text().splitlines()
-    assert [json.loads(line) for line in lines] == RECORDS + RECORDS
+    assert read_lines(path) == RECORDS + RECORDS

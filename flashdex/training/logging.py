@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from flashdex.system.jsonl import append_line, drop_cut_line, keep_lines
 from flashdex.system.run_files import CSV, METRICS, WANDB, read_metrics
 
 _LOG = logging.getLogger(__name__)
+_OFF = ("offline", "disabled", "dryrun")  # what W&B itself is told not to send
 WAIT_S = 30.0  # for W&B's server, when a session begins; and for the last of it
 
 
@@ -93,24 +95,29 @@ class CsvWriter:
 
 
 def check_writers(recipe: RunRecipe) -> None:
-    """Refuse a recipe whose W&B cannot log in, before anything is prepared.
+    """Refuse a recipe whose writers could not begin, before anything is made for it.
 
     Raises:
-        FlashdexError: the package or the key is missing.
+        FlashdexError: W&B is not installed, has no key, or cannot be reached; it says
+            how to go on without the network.
     """
     if "wandb" not in recipe.logger.kind:
         return
     wandb = _import_wandb()
-    if recipe.logger.wandb_mode == "offline":
+    if recipe.logger.wandb_mode == "offline" or os.environ.get("WANDB_MODE") in _OFF:
         return
-    there = True
-    with suppress(Exception):  # no network, say: tried again when the run begins
-        there = wandb.login(prompt=False) is not False
-    if not there:
+    wandb.setup(settings=wandb.Settings(silent=True))
+    try:
+        problem = "" if wandb.login(prompt=False) else "has no key (`wandb login` once)"
+    except TypeError:  # an older W&B cannot be asked without a prompt
+        return
+    except Exception as error:  # its own errors, and those of whatever carries it
+        problem = f"does not answer ({' '.join(str(error).split())[:200]})"
+    if problem:
         raise FlashdexError(
-            "logger.kind: 'wandb' is named, but there is no key to log in with. Run "
-            "'wandb login', set WANDB_API_KEY, write files to be synced later with "
-            "logger.wandb_mode=offline, or take it out of logger.kind."
+            f"logger.kind: W&B {problem}. Or add logger.wandb_mode=offline, which "
+            "keeps the records in the run's folder for `wandb sync`, or take wandb out "
+            "of logger.kind; metrics.jsonl is written in any case."
         )
 
 
@@ -151,12 +158,13 @@ class WandbWriter:
             "dir": str(run_dir),
             "settings": self._wandb.Settings(**options),
         }
-        self._run = self._begin(c.wandb_mode, run_id)
+        told = os.environ.get("WANDB_MODE")
+        self._run = self._begin(told if told in _OFF else c.wandb_mode, run_id)
         self._run.define_metric("env_steps")
         self._run.define_metric("hours")
         self._run.define_metric("*", step_metric="env_steps")
         # what a later session may go on with
-        self.run_id = None if self._run.offline else self._run.id
+        self.run_id = None if self._run.settings._offline else self._run.id
 
     def _begin(self, mode: str, run_id: str | None) -> Any:
         if mode == "online":
@@ -169,7 +177,8 @@ class WandbWriter:
                     "them with 'wandb sync'",
                     _first_line(error),
                 )
-        return self._wandb.init(mode="offline", **self._options)
+            mode = "offline"
+        return self._wandb.init(mode=mode, **self._options)
 
     def write(self, record: dict[str, float]) -> None:
         """Log one record."""

@@ -161,6 +161,8 @@ class ReplayLog:
         try:
             manifest, segments = _read(self.run_dir, stem)
             if not manifest:
+                if self.enabled:
+                    _LOG.warning("checkpoint %s has no replay rows", stem)
                 return False
             if manifest.get("meaning") != self.meaning:
                 _LOG.warning("an override changed what replay rows mean: none is kept")

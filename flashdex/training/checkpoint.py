@@ -36,6 +36,7 @@ TYPES: dict[str, tuple[type, ...]] = {
     "env_steps": (int,),
     "vector_steps": (int,),
     "env_steps_lost": (int,),
+    "records": (int,),
     "ledger_bytes": (int,),
     "wall_s": (float, int),
     "learner": (dict,),

@@ -46,10 +46,12 @@ class JsonlWriter:
         drop_cut_line(self._path)
         if env_steps is not None:
             keep_lines(self._path, lambda record: record["env_steps"] <= env_steps)
+        self.count = len(read_metrics(run_dir))
 
     def write(self, record: dict[str, float]) -> None:
         """Append; the record is on the disk then."""
         append_line(self._path, record)
+        self.count += 1
 
     def close(self) -> None:
         """Every record is on the disk already."""
@@ -241,7 +243,8 @@ class MetricLog:
         wandb_id: str | None = None,
         env_steps: int | None = None,
     ) -> None:
-        self.writers: list[MetricWriter] = [JsonlWriter(run_dir, env_steps=env_steps)]
+        self.lines = JsonlWriter(run_dir, env_steps=env_steps)
+        self.writers: list[MetricWriter] = [self.lines]
         self.wandb_id = wandb_id
         if "csv" in recipe.logger.kind:
             self.writers.append(Copy(CSV, lambda: CsvWriter(run_dir)))

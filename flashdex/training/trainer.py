@@ -22,6 +22,7 @@ from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.files import RunHold
+from flashdex.system.run_files import METRICS
 from flashdex.system.tensors import first_non_finite
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
@@ -336,6 +337,7 @@ class Trainer:
             "torch_rng": torch.get_rng_state(),
             "recipe": dump_recipe(self.recipe),
             "wandb_id": self.log.wandb_id,
+            "records": self.log.lines.count,
             "run": self.start.run,
             **self.task.state_dict(),
         }
@@ -343,6 +345,12 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore all of ``state_dict`` but the learner, which is restored already."""
         self.vector_steps = state.get("vector_steps", 0)
+        if self.log.lines.count < state.get("records", 0):
+            _LOG.warning(
+                "%s is shorter than at the checkpoint: %d records are missing",
+                self.run_dir / METRICS,
+                state["records"] - self.log.lines.count,
+            )
         self.task.load_state_dict(state)
         if "torch_rng" in state:
             torch.set_rng_state(state["torch_rng"])

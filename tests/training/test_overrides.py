@@ -83,7 +83,14 @@ def test_an_evaluation_with_other_networks_is_refused_in_one_line(train_tiny, ca
 def test_a_resume_asks_for_exactly_what_a_checkpoint_holds(train_tiny):
     run_dir = train_tiny()
     state = load_checkpoint(run_dir)
-    assert set(state) == {*RESUMED, "format", "sealed", "run", "env_steps_lost"}
+    assert set(state) == {
+        *RESUMED,
+        "format",
+        "sealed",
+        "run",
+        "records",
+        "env_steps_lost",
+    }
     (path,) = (run_dir / "checkpoints").glob("*.pt")
     del state["torch_rng"], state["assist_epoch"]
     write_tensors(state, run_dir, "checkpoints", path.name)

@@ -34,13 +34,29 @@ def write_tensors(content: Any, root: Path, *parts: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    try:
-        with open_own(root, *parts) as file:
-            torch.save(content, file)
-            _seal(file)
-    except RuntimeError as error:
-        # torch's writer reports a failed write as a RuntimeError of its own
-        raise OSError(f"{root.joinpath(*parts)}: {error}") from error
+    with open_own(root, *parts) as file:
+        sink = _Sink(file)
+        try:
+            torch.save(content, sink)  # type: ignore[arg-type]
+        except RuntimeError:
+            # torch's writer makes a RuntimeError of its own of a failed write
+            raise sink.fault or OSError("the tensors cannot be written") from None
+        _seal(file)
+
+
+class _Sink:
+    """A file that keeps the error of a failed write."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.flush = file, file.flush
+        self.fault: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        try:
+            return self.file.write(data)
+        except OSError as error:
+            self.fault = error
+            raise
 
 
 def _seal(file: BinaryIO) -> None:

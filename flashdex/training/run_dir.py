@@ -231,10 +231,12 @@ def _end(trainer: Trainer, hold: RunHold, why: str) -> None:
     quiet = [] if why != "error" else [OSError, RunError]
     with contextlib.suppress(*quiet):
         trainer.close(wait=why != "error")
-    # the disk may be what ended it, or the folder is no longer there
-    with contextlib.suppress(OSError, RunError):
+    try:
         hold.check()
         end_session(hold.path, why, env_steps=trainer.env_steps, wall_s=trainer.wall_s)
+    # the disk may be what ended it, or the folder is no longer there
+    except (OSError, RunError) as error:
+        _LOG.warning("the end of the session is not recorded: %s", error)
 
 
 def make_trainer(

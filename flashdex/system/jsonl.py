@@ -47,6 +47,8 @@ def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]
     """
     content = _read(path)
     whole = content[: _whole(content)]
+    if len(whole) < len(content):
+        _LOG.warning("%s: its last line is not whole and is left out", path)
     out, before, sealed, position = [], "", False, 0
     for number, raw in enumerate(whole.split(b"\n")[:-1], start=1):
         length = len(raw) + 1
@@ -201,8 +203,10 @@ def read_object(root: Path, *parts: str) -> dict[str, Any]:
     Raises:
         RunError: it is damaged, was changed, or is something else.
     """
-    text = (read_own(root, *parts) or "{}").removesuffix("\n")
-    path = root.joinpath(*parts)
+    text = read_own(root, *parts)
+    if text is None:
+        return {}
+    path, text = root.joinpath(*parts), text.removesuffix("\n")
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -257,3 +257,39 @@ def read_sessions(run_dir: Path) -> list[dict[str, Any]]:
         schema = {"start": STARTED, "end": ENDED}.get(line["event"], {})
         check_keys(line, schema, path, number)
     return lines
+
+
+def line_counts(run_dir: Path) -> dict[str, int]:
+    """How many lines the files have that only grow while a session lasts."""
+    paths = {name: own_file(run_dir, name) for name in (METRICS, CONVERSIONS)}
+    return {name: len(read_lines(p)) for name, p in paths.items() if p.exists()}
+
+
+def check_sessions(run_dir: Path, *, counts: bool = True) -> None:
+    """Refuse a run whose other files are not those that its last session left.
+
+    The seals of a file do not tell that lines at its end, or all of it, are gone.
+
+    Args:
+        run_dir: the folder.
+        counts: look for lines that are missing, too.
+
+    Raises:
+        RunError: lines are missing, or ``versions.json`` is another run's.
+    """
+    lines = read_sessions(run_dir)
+    begun = next((x for x in reversed(lines) if x["event"] == "start"), {})
+    if begun.get("run", "") not in ("", run_id(run_dir)):
+        raise RunError(
+            f"{run_dir / VERSIONS}: is not that of this run, or is missing. Restore it "
+            "from a copy."
+        )
+    told = lines[-1].get("lines") if counts and lines else None
+    now = line_counts(run_dir) if told else {}
+    for name, count in (told or {}).items():
+        missing = count - now.get(name, 0)
+        if missing > 0:
+            raise RunError(
+                f"{run_dir / name}: {missing} lines are missing that were there when "
+                "the last session ended. Restore the file from a copy."
+            )

@@ -25,6 +25,7 @@ from flashdex.system.run_files import (
     EVALUATION,
     RECIPE,
     check_run,
+    check_sessions,
     hold_run,
     new_run,
     read_recipe,
@@ -101,6 +102,7 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     check_writers(recipe)
     with hold_run(run_dir) as hold:
         check_run(run_dir)
+        check_sessions(run_dir)
         with reported(run_dir):
             remove_temporaries(run_dir)
         state = None
@@ -173,6 +175,7 @@ def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> RunRec
     """
     read_recipe(run_dir)
     check_run(run_dir)
+    check_sessions(run_dir, counts=False)
     return load_recipe(run_dir / RECIPE, overrides or [])
 
 

@@ -21,7 +21,13 @@ from flashdex.recipe import RunRecipe
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.system.files import own_file
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
-from flashdex.system.run_files import SESSIONS, read_metrics, read_sessions, run_id
+from flashdex.system.run_files import (
+    SESSIONS,
+    line_counts,
+    read_metrics,
+    read_sessions,
+    run_id,
+)
 
 _LOG = logging.getLogger(__name__)
 LABELS = ("name", "ablation", "seed", "run_dir")  # of the records so far
@@ -78,6 +84,7 @@ def end_session(run_dir: Path, why: str, *, env_steps: int, wall_s: float) -> No
     """Write the ``end`` line; a session without one crashed, or is running."""
     counters = {"env_steps": env_steps, "wall_s": wall_s}
     line = {"event": "end", "date": _now(), **counters, "why": why}
+    line["lines"] = line_counts(run_dir)
     append_line(own_file(run_dir, SESSIONS), line)
 
 

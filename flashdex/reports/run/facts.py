@@ -22,6 +22,7 @@ from flashdex.system.run_files import (
     ROLLOUTS,
     VERSIONS,
     check_run,
+    check_sessions,
     read_metrics,
     read_recipe,
 )
@@ -84,6 +85,7 @@ def load_run(run_dir: str | Path) -> RunData:
     recipe = path / RECIPE
     read_recipe(path)  # refuses what is none, or was changed
     check_run(path)
+    check_sessions(path)
     try:
         composed = yaml.safe_load(recipe.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:

@@ -40,6 +40,7 @@ TYPES: dict[str, tuple[type, ...]] = {
     "ledger_bytes": (int,),
     "wall_s": (float, int),
     "learner": (dict,),
+    "update": (dict, type(None)),  # of a dump
     "recipe": (str,),
     "run": (str,),
     "wandb_id": (str, type(None)),

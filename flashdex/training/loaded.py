@@ -18,8 +18,9 @@ from flashdex.errors import RunError
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_lines
-from flashdex.training.logging import METRICS
+from flashdex.system.run_files import read_metrics
 from flashdex.training.run_dir import load_learner, load_run_recipe
 
 
@@ -70,12 +71,12 @@ class Run:
     @cached_property
     def attempts(self) -> list[dict[str, Any]]:
         """Lines of ``conversions.jsonl``, one an attempt."""
-        return read_lines(self.path / CONVERSIONS)
+        return read_lines(own_file(self.path, CONVERSIONS))
 
     @cached_property
     def metrics(self) -> list[dict[str, Any]]:
         """Records of ``metrics.jsonl``."""
-        return read_lines(self.path / METRICS)
+        return read_metrics(self.path)
 
     @property
     def converted(self) -> dict[str, dict[str, Any]]:
@@ -91,7 +92,7 @@ class Run:
         if motion not in self.converted:
             known = ", ".join(self.converted) or "none"
             raise RunError(f"{self.path}: no rollout of '{motion}'. Stored: {known}.")
-        return Rollout.load(self.path / self.converted[motion]["rollout"])
+        return Rollout.load(own_file(self.path, self.converted[motion]["rollout"]))
 
     def policy(self) -> RunPolicy:
         """The newest policy."""

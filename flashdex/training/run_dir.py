@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RunError
+from flashdex.errors import RecipeError, RunError
 from flashdex.recipe import GymRecipe, RunRecipe, dump_recipe, load_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
@@ -350,7 +350,11 @@ def reopen(path: str | Path) -> tuple[Learner, Callable[[], TensorDictBase]]:
     with TemporaryDirectory() as folder:
         file = Path(folder) / RECIPE
         file.write_text(dump["recipe"], encoding="utf-8")
-        recipe = load_recipe(file)
+        try:
+            recipe = load_recipe(file)
+        except RecipeError as error:
+            where = f"{path}, its recipe"
+            raise RecipeError(error.problems, where=where) from error
     task = task_of(recipe).open(recipe)
     learner = task.make_learner(task.make_env())
     _load(learner, dump["learner"], worlds_key=task.worlds_key)

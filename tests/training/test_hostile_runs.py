@@ -16,12 +16,13 @@ import torch
 from gym_runs import tiny_recipe
 from hostile import CONTENT, PLANTED, Disk, command, drawn, fingerprint, flip_bit
 
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import dump_recipe
 from flashdex.system.files import run_lock
 from flashdex.system.jsonl import read_lines, read_object
 from flashdex.system.run_files import (
     CHECKPOINTS,
+    DUMP,
     EVALUATION,
     FILES,
     FILMS,
@@ -31,6 +32,7 @@ from flashdex.system.run_files import (
     RECIPE,
     REPLAY,
     ROLLOUTS,
+    read_recipe,
     read_sessions,
     run_id,
 )
@@ -323,6 +325,31 @@ def test_a_file_that_runs_code_is_not_run(run_dir, use, tmp_path):
     with pytest.raises(RunError, match="not a readable dump"):
         reopen(run_dir / "nan_dump.pt")
     assert not (tmp_path / "sprung").exists()
+
+
+DUMPED = {
+    "code": {"recipe": "_target_: os.mkdir\n"},
+    "code_in_a_part": {"recipe": "algo: {_target_: os.mkdir}\n"},
+    "tag": {"recipe": "a: !!python/object/apply:os.mkdir [sprung]\n"},
+    "no_recipe": {"recipe": None},
+    "no_text": {"recipe": 5},
+    "no_learner": {"learner": []},
+    "no_state": {"torch_rng": [1, 2]},
+    "no_batch": {"update": [1]},
+    "other_networks": {"learner": {"agent": {}}},
+}
+
+
+@pytest.mark.parametrize("change", DUMPED.values(), ids=DUMPED)
+def test_a_forged_dump_is_refused_and_runs_nothing(change, run_dir, monkeypatch):
+    monkeypatch.chdir(run_dir)
+    dump = {"format": 3, "what": "x", "learner": {}, "update": {}}
+    dump |= {"recipe": read_recipe(run_dir), "torch_rng": torch.get_rng_state()}
+    dump |= change
+    write_tensors({k: v for k, v in dump.items() if v is not None}, run_dir, DUMP)
+    with pytest.raises(FlashdexError):
+        reopen(run_dir / DUMP)
+    assert not (run_dir / "sprung").exists()
 
 
 # a run is a folder, not a path

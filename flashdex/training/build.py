@@ -280,7 +280,7 @@ class RunBuilder:
             seed=recipe.seed,
             made_by=made_by or versions(recipe.physics.engine, device),
             provenance={**(provenance or {}), "physics": settings_of(recipe)},
-            motion_hash=getattr(self.library, "motion_hash", None),
+            motion_hash=self.library.motion_hash,
         )
 
     def make_transforms(self, bank: ReferenceBank) -> list[Transform]:

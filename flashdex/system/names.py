@@ -35,9 +35,10 @@ def check_name(name: Any, *, what: str, where: str = "") -> str:
         shown = ascii(name)
         shown = shown if len(shown) < 80 else f"{shown[:80]}..."
         place = f"{where}: " if where else ""
+        article = "an" if what[0] in "aeiou" else "a"
         raise FlashdexError(
-            f"{place}{shown} is no name of a {what}: {fault}. A name is one line of "
-            f"printable text of at most {NAME_BYTES} bytes, without / and \\."
+            f"{place}{shown} is no name of {article} {what}: {fault}. A name is one "
+            f"line of printable text of at most {NAME_BYTES} bytes, without / and \\."
         )
     return name
 

@@ -13,9 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
@@ -28,7 +26,6 @@ from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.assembly import make_transforms
 from flashdex.errors import DemoError, FlashdexError, LibraryError
-from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_format import MANIFEST, OldLibraryError
@@ -36,6 +33,7 @@ from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
+from flashdex.rollouts.truth import leading_time, settings_of
 from flashdex.system.machine import versions
 
 JOINT_SLACK = 0.5  # m or rad beyond a hand's range that a reference may ask for
@@ -253,7 +251,7 @@ class RunBuilder:
             self.hands,
             recipe.env,
             step_dt=self.step_dt,
-            lead_s=self._wrist_lead() if recipe.env.wrist_lead else None,
+            lead_s=leading_time(self.hands, recipe),
             seed=recipe.seed if seed is None else seed,
             evaluation=evaluation,
         )
@@ -269,7 +267,7 @@ class RunBuilder:
         scenes: list[Scene],
         *,
         made_by: dict[str, Any] | None = None,
-        provenance: dict[str, str] | None = None,
+        provenance: dict[str, Any] | None = None,
     ) -> RolloutBuilder:
         """Build what turns episodes into rollouts."""
         recipe, device = self.recipe, self.bank.table.device
@@ -281,16 +279,9 @@ class RunBuilder:
             criterion=recipe.train.criterion,
             seed=recipe.seed,
             made_by=made_by or versions(recipe.physics.engine, device),
-            provenance=provenance,
+            provenance={**(provenance or {}), "physics": settings_of(recipe)},
+            motion_hash=self.library.motion_hash,
         )
-
-    def _wrist_lead(self) -> Tensor:
-        """Lag of the wrist servos, s, (2, J); zero for the fingers."""
-        gains = self.recipe.physics.gains
-        lags = [servo_lag(self.hands[s].gains[gains]) for s in keys.SIDES]
-        lead = torch.tensor(np.stack(lags), dtype=torch.float32)
-        lead[:, NUM_WRIST_JOINTS:] = 0.0
-        return lead
 
     def make_transforms(self, bank: ReferenceBank) -> list[Transform]:
         """Build the observation transforms of the recipe on the bank's device."""

@@ -13,6 +13,7 @@ from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.aggregate import mean_object_errors, mope_more
+from flashdex.metrics.criteria import worst_movement
 from flashdex.rollouts.build import RolloutBuilder
 from flashdex.rollouts.recorder import EpisodeRecorder
 from flashdex.rollouts.rollout import Rollout
@@ -20,7 +21,7 @@ from flashdex.training.build import RunBuilder
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]
 """State and environment to actions (N, 2, J)."""
-SHOWN = ("sr_mt_obj", "sr_mt", "sr_spider_raw", "sr_spider_centred")
+SHOWN = ("sr_mt_obj", "sr_mt_obj_moved", "sr_mt", "sr_spider_raw", "sr_spider_centred")
 
 
 def roll_all(
@@ -84,7 +85,8 @@ def evaluate_motions(
 
     Returns:
         ``totals``, rates and mean errors of the collection, and ``motions``, for each
-        its name, the state of each verdict and its errors.
+        its name, the state of each verdict, its errors by the criterion of the run, its
+        mean object errors, which the totals are means of, and its ratios of movement.
     """
 
     def act(td: TensorDictBase, env: TrackingEnv) -> Tensor:
@@ -95,14 +97,19 @@ def evaluate_motions(
     rows, errors = [], []
     for rollout in roll_all(builder, act, env_steps=env_steps):
         verdicts = rollout.score()
+        tracked = rollout.tracking_errors()
+        mean, ratios = mean_object_errors(tracked), worst_movement(tracked)
         values = verdicts[criterion].values.items()
         row = {
             "motion": rollout.motion,
             **{name: verdicts[name].state for name in names},
             "errors": {k: round(v, 5) for k, v in values},
+            # what the totals are means of
+            "mope": None if mean is None else mean.pos * 1e3,
+            "more": None if mean is None else mean.rot,
+            **{f"{key}_ratio": ratio for key, ratio in ratios.items()},
         }
         rows.append(row)
-        mean = mean_object_errors(rollout.tracking_errors())
         errors.append((mean, verdicts["sr_spider_centred"]))
     totals: dict[str, Any] = {"env_steps": env_steps, **mope_more(errors)}
     for name in names:

@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from flashdex.errors import LibraryError
+from flashdex.errors import FlashdexError, LibraryError
 from flashdex.motions.library_format import (
     FRAME_KEYS,
     OBJECT_KEYS,
     Manifest,
     as_library_error,
     hash_json,
+    is_hash,
 )
 from flashdex.motions.library_meshes import read_mesh
 from flashdex.motions.library_numbers import find_faults, part_fault
@@ -33,6 +34,7 @@ from flashdex.system.files import own_file
 
 Arrays = Mapping[str, np.ndarray]
 CHECK_VERSION = 1  # raise when a library is checked for more
+MAX_MARKS = 1000  # libraries that are remembered
 
 
 def _changes(path: Path, manifest: Manifest, arrays: Arrays) -> Iterator[str]:
@@ -95,6 +97,16 @@ def check_once(path: Path, manifest: Manifest, arrays: Arrays, *, refusal: str) 
         with suppress(OSError):  # without a cache it is checked again
             mark.parent.mkdir(parents=True, exist_ok=True)
             mark.touch()
+            _forget_old(mark.parent)
+
+
+def _forget_old(folder: Path) -> None:
+    """Libraries come and go; the newest marks are enough."""
+    marks = [mark for mark in folder.iterdir() if is_hash(mark.name)]
+    if len(marks) > MAX_MARKS:
+        marks.sort(key=lambda mark: mark.stat().st_mtime_ns)
+        for mark in marks[: -MAX_MARKS // 2]:
+            mark.unlink(missing_ok=True)
 
 
 def check_all(path: Path, manifest: Manifest, arrays: Arrays) -> list[str]:
@@ -124,7 +136,7 @@ def _mark(path: Path, manifest: Manifest) -> Path | None:
             # an edit that sets the time back has another time of change
             times = found.st_mtime_ns, found.st_ctime_ns
             stamps.append([found.st_dev, found.st_ino, found.st_size, *times])
-    except (OSError, RuntimeError):  # a file is missing, or there is no home
+    except (OSError, FlashdexError):  # a file is missing, or there is no home
         return None
     return root / "libraries" / hash_json([CHECK_VERSION, manifest.sha256, stamps])
 

@@ -26,6 +26,7 @@ from flashdex.replay.buffer import check_pinning
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, ScorerSpec
+from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.machine import versions
 from flashdex.system.run_files import BASELINES, MOTIONS
@@ -136,7 +137,7 @@ class TrackingTask(Task):
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)
         self._remember_motions(run_dir)
-        baselines = score_baselines(self.builder, run_dir / BASELINES)
+        baselines = score_baselines(self.builder, own_file(run_dir, BASELINES))
         self.ledger = open_ledger(
             self.builder,
             run_dir,

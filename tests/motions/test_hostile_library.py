@@ -323,6 +323,21 @@ def no_home():
     raise RuntimeError("Could not determine home directory.")
 
 
+def test_the_memory_of_libraries_stays_small(copy, tmp_path, monkeypatch):
+    monkeypatch.setattr(library_check, "MAX_MARKS", 4)
+    folder = tmp_path / "cache" / "libraries"
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("mine")
+    for i in range(6):
+        (folder / f"{i:064d}").touch()
+        os.utime(folder / f"{i:064d}", (i, i))
+    MotionLibrary.load(copy)
+    held = sorted(path.name for path in folder.iterdir())
+    assert len(held) == 3
+    assert f"{5:064d}" in held
+    assert "notes.txt" in held
+
+
 def test_verify_names_every_fault(copy, library):
     opened = MotionLibrary.load(copy)
     assert opened.verify() == []

@@ -249,7 +249,7 @@ def split_foreign(
     """
     kept = dict(data)
     task = data.get("task", DEFAULT_TASK)
-    if task not in KINDS:
+    if not isinstance(task, str) or task not in KINDS:
         problems.append(
             f"task: {task!r} is not a task.{nearest(str(task), KINDS)} "
             f"Allowed: {', '.join(KINDS)}."

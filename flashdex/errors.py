@@ -24,7 +24,7 @@ class FlashdexError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return a text whose control characters, but line ends, are shown as escapes.
+    r"""Return a text whose control characters, but line ends, are shown as escapes.
 
     What comes from a file must neither steer the terminal nor hide in it.
 

@@ -19,6 +19,7 @@ from flashdex.recipe.check import read_recipe
 from flashdex.recipe.overrides import (
     Change,
     apply_changes,
+    expand_home,
     expand_sweeps,
     fill_in,
     merge,
@@ -272,6 +273,7 @@ def _read(
     data = merge(kind_of(data).make_base(), data)
     apply_changes(data, changes, problems)
     fill_in(data, problems)
+    expand_home(data)
     recipe, found = read_recipe(mark_groups(data, groups))
     return recipe, problems + found
 
@@ -306,6 +308,7 @@ def _change(data: dict[str, Any], overrides: Sequence[str], *, where: str) -> Ru
     changes, problems = parse_overrides(overrides)
     apply_changes(data, changes, problems)
     fill_in(data, problems)
+    expand_home(data)
     recipe, found = read_recipe(data)
     if problems + found:
         raise RecipeError(problems + found, where=where)

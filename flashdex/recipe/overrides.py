@@ -7,6 +7,7 @@ grammar cannot read is taken as the text that it is, so that a path is a path.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -165,6 +166,16 @@ def _enter(place: Any, key: str, path: str) -> Any:
         allowed = f" There are: {', '.join(known)}." if known else ""
         raise LookupError(f"{path} does not exist.{nearest(key, known)}{allowed}")
     return place[_index(place, key)]
+
+
+def expand_home(data: dict[str, Any]) -> None:
+    """Put the home folder for a leading `~/` of a path, in place, as a shell would."""
+    for key in PATHS:
+        *way, last = key.split(".")
+        place = _look_up(data, ".".join(way)) if way else data
+        path = place.get(last) if isinstance(place, dict) else None
+        if isinstance(path, str) and path.startswith("~/"):
+            place[last] = os.path.expanduser(path)
 
 
 def fill_in(data: dict[str, Any], problems: list[str]) -> None:

@@ -24,7 +24,10 @@ MAX_VALUES = 50_000
 _PLAIN = (dict, list, str, int, float, bool, type(None))
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+_Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # C is ten times faster
+
+
+class _Loader(_Base):
     """Safe loading of keys and values: no key twice, no date, no merged mapping."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:

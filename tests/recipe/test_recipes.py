@@ -267,7 +267,9 @@ def leaves(data, path=()):
 
 def default_of(path):
     """Look a path up in the schema's defaults, options of named parts included."""
-    recipe = GymRecipe(name="any", total_env_steps=10**9, gym=GymConfig(env_id="Any-v0"))
+    recipe = GymRecipe(
+        name="any", total_env_steps=10**9, gym=GymConfig(env_id="Any-v0")
+    )
     if path[0] != "gym":
         motions = MotionsConfig(source="procedural")
         recipe = validate(Recipe(name="any", total_env_steps=10**9, motions=motions))

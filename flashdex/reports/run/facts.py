@@ -9,11 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from flashdex.errors import RunError, UnknownNameError
+from flashdex.errors import RecipeError, RunError, UnknownNameError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
+from flashdex.recipe.reader import read_yaml
 
 Line = dict[str, Any]
 ATTEMPT_KEYS = ("motion", "converted", "errors", "env_steps", "wall_s")
@@ -71,12 +70,12 @@ def load_run(run_dir: str | Path) -> RunData:
             "folder that 'flashdex train' wrote, usually runs/<name>."
         )
     try:
-        composed = yaml.safe_load(recipe.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise RunError(f"{recipe}: not YAML ({error}). Restore the file.") from error
+        composed = read_yaml(recipe)
+    except RecipeError as error:
+        raise RunError(f"{error}\nRestore the file.") from error
     return RunData(
         path=path,
-        recipe=composed if isinstance(composed, dict) else {},
+        recipe=composed,
         versions=_read_json(path / "versions.json"),
         metrics=_drop_repeated(
             _read_lines(path / "metrics.jsonl", needs=("env_steps",))

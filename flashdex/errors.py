@@ -80,6 +80,12 @@ class UnknownRecipeError(UnknownNameError):
     kind = "recipe"
 
 
+class UnknownOptionError(UnknownNameError):
+    """An option of a group of recipes that does not exist."""
+
+    kind = "option"
+
+
 class RecipeError(FlashdexError):
     """All mistakes of a recipe at once, each with its YAML path."""
 

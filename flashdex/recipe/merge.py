@@ -328,12 +328,18 @@ def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
     files = [file for path in paths for file in _files(path)]
     problems = []
     for file in files:
-        group = group_of(file)
-        found = inspect_option(file, group) if group else inspect_recipe(file)[1]
-        problems += [f"{file}: {problem}" for problem in found]
+        problems += [f"{file}: {problem}" for problem in _problems_of(file)]
     if problems:
         raise RecipeError(problems, where=f"{len(files)} recipes checked")
     return files
+
+
+def _problems_of(file: Path) -> list[str]:
+    try:
+        group = group_of(file)
+    except RecipeError as error:
+        return error.problems
+    return inspect_option(file, group) if group else inspect_recipe(file)[1]
 
 
 def _files(path: str | Path) -> list[Path]:

@@ -10,7 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import flashdex
-from flashdex.errors import FlashdexError, RecipeError, UnknownRecipeError
+from flashdex.errors import (
+    FlashdexError,
+    RecipeError,
+    UnknownOptionError,
+    UnknownRecipeError,
+)
 from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
 
 DEFAULT_TASK, GYM_TASK = "retarget", "gym"
@@ -81,13 +86,23 @@ def find_option(name: str | Path) -> Path | None:
     for folder in search_dirs() if option and "/" not in option else ():
         if is_file(folder / group / f"{option}.yaml"):
             return folder / group / f"{option}.yaml"
+    known = known_groups()
+    if group in known and option and not is_file(Path(name)):
+        raise UnknownOptionError(option, known[group], where=group)
     return None
 
 
 def group_of(path: Path) -> str | None:
-    """Return the group that a file is an option of; None for a recipe."""
-    group = path.resolve().parent.name
-    return group if group in known_groups() else None
+    """Return the group that a file is an option of; None for a recipe.
+
+    Raises:
+        RecipeError: it cannot be read.
+    """
+    text, group = read_text(path), path.resolve().parent.name
+    if "# @package " in text:
+        return group
+    is_whole = "total_env_steps" in text  # every recipe gives it, an option need not
+    return group if group in known_groups() and not is_whole else None
 
 
 def known_groups(folder: Path | None = None) -> dict[str, list[str]]:

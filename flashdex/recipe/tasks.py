@@ -13,7 +13,7 @@ from flashdex.envs.config import GymConfig
 from flashdex.envs.mdp.term import KINDS as TERM_KINDS
 from flashdex.envs.mdp.term import default_mapping, registry, terms_of
 from flashdex.errors import FlashdexError, nearest
-from flashdex.hands.spec import known_hands
+from flashdex.hands import known_hands
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import DEFAULT_TASK, GYM_TASK

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +15,7 @@ from flashdex.system.files import write_atomic
 from flashdex.system.jsonl import drop_cut_line, keep_lines
 
 METRICS = "metrics.jsonl"
+_OFF = ("offline", "disabled", "dryrun")  # what W&B itself is told not to send
 
 
 class MetricWriter(Protocol):
@@ -89,19 +91,51 @@ class CsvWriter:
         """Every row is on disk already."""
 
 
+def check_writers(recipe: RunRecipe) -> None:
+    """Refuse a recipe whose writers could not begin, before anything is made for it.
+
+    Raises:
+        FlashdexError: W&B is not installed, has no key, or cannot be reached; it says
+            how to go on without the network.
+    """
+    if "wandb" not in recipe.logger.kind:
+        return
+    wandb = _import_wandb()
+    if recipe.logger.wandb_mode == "offline" or os.environ.get("WANDB_MODE") in _OFF:
+        return
+    wandb.setup(settings=wandb.Settings(silent=True))
+    try:
+        problem = "" if wandb.login(prompt=False) else "has no key (`wandb login` once)"
+    except TypeError:  # an older W&B cannot be asked without a prompt
+        return
+    except Exception as error:  # its own errors, and those of whatever carries it
+        problem = f"does not answer ({' '.join(str(error).split())[:200]})"
+    if problem:
+        raise FlashdexError(
+            f"logger.kind: W&B {problem}. Or add logger.wandb_mode=offline, which "
+            "keeps the records in the run's folder for `wandb sync`, or take wandb out of "
+            "logger.kind; metrics.jsonl is written in any case."
+        )
+
+
+def _import_wandb() -> Any:
+    try:
+        import wandb
+    except ImportError as error:
+        raise FlashdexError(
+            "logger.kind: 'wandb' is named, but the package is not installed. "
+            "Install it (pip install wandb) or take it out of logger.kind."
+        ) from error
+    return wandb
+
+
 class WandbWriter:
     """Weights & Biases, on its own axes: env steps and hours, never W&B's step."""
 
     def __init__(
         self, run_dir: Path, recipe: RunRecipe, *, run_id: str | None = None
     ) -> None:
-        try:
-            import wandb
-        except ImportError as error:
-            raise FlashdexError(
-                "logger.kind: 'wandb' is named, but the package is not installed. "
-                "Install it (pip install wandb) or take it out of logger.kind."
-            ) from error
+        wandb = _import_wandb()
         c = recipe.logger
         self._run = wandb.init(
             project=c.wandb_project,

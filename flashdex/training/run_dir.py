@@ -31,7 +31,7 @@ from flashdex.training.checkpoint import (
 )
 from flashdex.training.guard import GradientGuard, numeric_errors, read_dump
 from flashdex.training.gym import GymTask
-from flashdex.training.logging import MetricLog
+from flashdex.training.logging import MetricLog, check_writers
 from flashdex.training.session import (
     begin_session,
     end_session,
@@ -66,6 +66,7 @@ def train(recipe: RunRecipe) -> Path:
     """
     run_dir = default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
+    check_writers(recipe)
     task = task_of(recipe).open(recipe, run_dir)
     with new_run(run_dir, recipe):
         return _train(task, run_dir, None, [])
@@ -80,6 +81,7 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     """
     run_dir, overrides = Path(run), overrides or []
     recipe = load_run_recipe(run_dir, overrides)
+    check_writers(recipe)
     with run_lock(run_dir):
         remove_temporaries(run_dir)
         state = None

@@ -113,8 +113,8 @@ def check_writers(recipe: RunRecipe) -> None:
     if problem:
         raise FlashdexError(
             f"logger.kind: W&B {problem}. Or add logger.wandb_mode=offline, which "
-            "keeps the records in the run's folder for `wandb sync`, or take wandb out of "
-            "logger.kind; metrics.jsonl is written in any case."
+            "keeps the records in the run's folder for `wandb sync`, or take wandb out "
+            "of logger.kind; metrics.jsonl is written in any case."
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flashdex.cli.terminal import loading, number_above, say
+from flashdex.cli.terminal import loading, number_above, path, say
 from flashdex.datasets import source_names
 from flashdex.errors import FlashdexError, UnknownHandError, UnknownSourceError
 from flashdex.hands import known_hands
@@ -30,19 +30,19 @@ def add_data_verbs(
     """
     verb = add("fetch", _fetch, "download recordings that need no registration")
     verb.add_argument("name", help="myodm: 95 clips of one hand and one object")
-    verb.add_argument("--out", type=Path, help="folder (default: in the cache)")
-    verb.add_argument("--wheel", type=Path, help="package file fetched by other means")
+    verb.add_argument("--out", type=path, help="folder (default: in the cache)")
+    verb.add_argument("--wheel", type=path, help="package file fetched by other means")
 
     verb = add("prepare", _prepare, "make a motion library from recordings")
     verb.add_argument(
         "--source", required=True, help="reader; `flashdex ls` says what each reads"
     )
-    verb.add_argument("--input", type=Path, help="folder (or file) of the recordings")
+    verb.add_argument("--input", type=path, help="folder (or file) of the recordings")
     verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
-    verb.add_argument("--out", type=Path, help="folder of the library")
-    verb.add_argument("--mano", type=Path, help="folder with MANO_LEFT, MANO_RIGHT")
-    verb.add_argument("--models", type=Path, help="folder of the object models")
-    verb.add_argument("--splits", type=Path, help="file that names the splits")
+    verb.add_argument("--out", type=path, help="folder of the library")
+    verb.add_argument("--mano", type=path, help="folder with MANO_LEFT, MANO_RIGHT")
+    verb.add_argument("--models", type=path, help="folder of the object models")
+    verb.add_argument("--splits", type=path, help="file that names the splits")
     rate, count = number_above(0), number_above(0, whole=True)
     verb.add_argument(
         "--hz", type=rate, default=60.0, help="control rate, 1/s (%(default)g)"
@@ -86,7 +86,7 @@ def add_data_verbs(
         metavar="key=value",
         help="changes, e.g. motions.library=libraries/mine",
     )
-    verb.add_argument("--out", type=Path, help="JSON file for every score")
+    verb.add_argument("--out", type=path, help="JSON file for every score")
 
 
 def _fetch(args: argparse.Namespace) -> int:

@@ -16,7 +16,14 @@ from pathlib import Path
 
 import flashdex
 from flashdex.cli.data import Handler, add_data_verbs
-from flashdex.cli.terminal import INTERRUPTED, Formatter, loading, say, set_up_streams
+from flashdex.cli.terminal import (
+    INTERRUPTED,
+    Formatter,
+    loading,
+    path,
+    say,
+    set_up_streams,
+)
 from flashdex.errors import FlashdexError, nearest
 
 
@@ -134,11 +141,15 @@ def _add_recipe_verbs(
 ) -> None:
     verb = add("cp", _cp, "copy a recipe, or an option of one, to edit it")
     verb.add_argument("recipe", help="name or path, or GROUP/OPTION: ablation/ppo")
-    verb.add_argument("dest", help="new file or folder")
+    verb.add_argument("dest", type=path, help="new file or folder")
 
     verb = add("validate", _validate, "find every mistake in recipes and options")
     verb.add_argument(
-        "paths", nargs="+", metavar="PATH", help="recipe, option of a group, or folder"
+        "paths",
+        type=path,
+        nargs="+",
+        metavar="PATH",
+        help="recipe, option of a group, or folder",
     )
     _add_allow(verb)
 
@@ -150,7 +161,7 @@ def _add_run_verbs(
     verb.add_argument("recipe", nargs="?", help="name or path")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
     one = verb.add_mutually_exclusive_group()
-    one.add_argument("--resume", type=Path, metavar="RUN", help="continue a run")
+    one.add_argument("--resume", type=path, metavar="RUN", help="continue a run")
     one.add_argument(
         "-m", "--multirun", action="store_true", help="one run for each of key=a,b"
     )
@@ -160,21 +171,21 @@ def _add_run_verbs(
     _add_allow(verb)
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
     _add_allow(verb)
 
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
 
     verb = add("score", _score, "score stored rollouts by every criterion")
     verb.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE", help="rollout .npz"
+        "files", type=path, nargs="+", metavar="FILE", help="rollout .npz"
     )
     verb.add_argument("--json", action="store_true", help="print JSON")
 
     verb = add("report", _report, "write report.html of a run again")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -209,8 +220,8 @@ def _validate(args: argparse.Namespace) -> int:
         from flashdex.recipe.merge import validate_paths
 
         found = validate_paths(args.paths)
-    for path in found:
-        say(f"ok  {path}")
+    for file in found:
+        say(f"ok  {file}")
     return 0
 
 
@@ -291,14 +302,14 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _score(args: argparse.Namespace) -> int:
-    absent = [str(path) for path in args.files if not path.is_file()]
+    absent = [str(file) for file in args.files if not file.is_file()]
     if absent:
         raise FlashdexError(f"{', '.join(absent)}: there is no such file")
     with loading():
         from flashdex.reports.run.terminal import score_table
         from flashdex.rollouts.rollout import Rollout
 
-    found = {str(path): Rollout.load(path).score() for path in args.files}
+    found = {str(file): Rollout.load(file).score() for file in args.files}
     if args.json:
         plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
         say(json.dumps(plain, indent=1))

@@ -11,6 +11,7 @@ import sys
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 from flashdex.errors import printable
@@ -67,6 +68,14 @@ def loading() -> Iterator[None]:
 
 def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(INTERRUPTED)
+
+
+def path(text: str) -> Path:
+    """A path that a file can have, for arguments of verbs."""
+    parts = [os.fsencode(part) for part in text.split("/")]
+    if not text or "\0" in text or max(map(len, parts)) > 255 or len(text) > 4000:
+        raise ArgumentTypeError(f"'{text[:40]}' and what follows cannot be a path")
+    return Path(text)
 
 
 def number_above(low: float, *, whole: bool = False) -> Callable[[str], float]:

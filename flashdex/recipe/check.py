@@ -172,6 +172,8 @@ def _build(cls: type, data: Any, path: str, problems: list[str]) -> Any:
             # Strict, or "1" were a number; in JSON a mapping still is a dataclass.
             return _adapter(cls).validate_json(json.dumps(root), strict=True)[0]
         except ValidationError as found:
+            if not found.errors()[0]["loc"]:
+                raise RecipeError([f"{path}: a text in it is not Unicode"]) from found
             for error in found.errors():
                 where, problem = _explain(cls, error, path)
                 if where not in noted:

@@ -246,7 +246,9 @@ def inspect_recipe(
     changes, problems = parse_overrides(overrides)
     composer = _Composer(path.parent, problems)
     changes = composer.choose(changes)
-    data = merge({"name": path.stem}, composer.compose(path))
+    # a file may be called by bytes that are no text
+    stem = path.stem.encode("utf-8", "replace").decode()
+    data = merge({"name": stem}, composer.compose(path))
     used = {group: options for group, options in composer.used.items() if options}
     if "ablation" in used:
         data["ablation"] = "+".join(used["ablation"] or ())

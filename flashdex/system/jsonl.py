@@ -1,56 +1,176 @@
-"""JSON-lines files that survive a crash in the middle of a line."""
+"""JSON-lines files that survive a crash, and tell when somebody changed them.
+
+Every line ends with a seal, the SHA-256 of the line and of the seal before it: a line
+that is edited, doubled, removed or moved breaks the chain. A seal keeps no secret;
+whoever writes the whole file anew writes fitting seals, see ``docs/security.md``.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from flashdex.system.files import write_atomic
+from flashdex.errors import RunError
+from flashdex.system.files import open_atomic, open_plain
+
+_LOG = logging.getLogger(__name__)
+SEAL = re.compile(rb', "sha256": "([0-9a-f]{64})"}\Z')
+SEAL_BYTES = 79  # of the end of a line that has one
+# key of a line -> the type its value has; float takes whole numbers as well
+Schema = Mapping[str, type | tuple[type, ...]]
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read a JSONL file; a last line cut off by a crash is left out."""
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
-    out = []
-    for number, line in enumerate(lines):
-        try:
-            out.append(json.loads(line))
-        except ValueError:
-            if number < len(lines) - 1:
-                raise
+def seal(text: str, before: str) -> str:
+    """A JSON object as the line that follows the one with the seal ``before``."""
+    found = hashlib.sha256((before + text).encode("utf-8")).hexdigest()
+    return f'{text[:-1]}, "sha256": "{found}"}}'
+
+
+def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]:
+    """Read a JSONL file, the seals left out; what a crash cut off is left out as well.
+
+    Lines of versions before the seals may stand before the first sealed one.
+
+    Args:
+        path: of the file; one that is not there has no lines.
+        schema: what every line has to hold.
+
+    Raises:
+        RunError: a line is damaged, changed, or of something else.
+    """
+    content = _read(path)
+    whole = content[: _whole(content)]
+    out, before, sealed, position = [], "", False, 0
+    for number, raw in enumerate(whole.split(b"\n")[:-1], start=1):
+        length = len(raw) + 1
+        found = SEAL.search(raw)
+        if found is None and sealed:
+            raise _fault(path, number, "has no seal, the one before it has one")
+        if found is not None:
+            if not sealed:  # the first one binds all that stood there before
+                before = hashlib.sha256(whole[:position]).hexdigest() if out else ""
+            sealed, body = True, raw[: found.start()] + b"}"
+            expected = hashlib.sha256(before.encode() + body).hexdigest()
+            before = found.group(1).decode()
+            if before != expected:
+                raise _fault(path, number, "was changed, or one before it is missing")
+            raw = body
+        out.append(_parse(path, number, raw, schema))
+        position += length
     return out
 
 
+def _read(path: Path) -> bytes:
+    try:
+        with open_plain(path) as file:
+            return file.read()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def _whole(content: bytes) -> int:
+    """Bytes of the lines that are whole.
+
+    A crash leaves a line without its end, or, where the file system had its length but
+    not its content yet, a tail of zeros.
+    """
+    return content.rstrip(b"\0").rfind(b"\n") + 1
+
+
+def _parse(
+    path: Path, number: int, raw: bytes, schema: Schema | None
+) -> dict[str, Any]:
+    try:
+        line = json.loads(raw.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise _fault(path, number, f"is not JSON ({error})") from error
+    if not isinstance(line, dict):
+        raise _fault(path, number, "is not a JSON object")
+    for key, kind in (schema or {}).items():
+        if key not in line:
+            raise _fault(path, number, f"lacks '{key}'")
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        kinds = (*kinds, int) if float in kinds else kinds
+        value = line[key]
+        if not isinstance(value, kinds) or (
+            isinstance(value, bool) and bool not in kinds
+        ):
+            raise _fault(path, number, f"has {value!r:.60} as '{key}'")
+    return line
+
+
+def _fault(path: Path, number: int, what: str) -> RunError:
+    return RunError(
+        f"{path}: line {number} {what}. flashdex only adds lines to this file; restore "
+        "it from a copy."
+    )
+
+
 def append_line(path: Path, line: dict[str, Any]) -> None:
-    """Append one line; it is on the disk when this returns."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    """Append one line; it is on the disk when this returns, or not in the file.
+
+    Raises:
+        OSError: the disk refuses, or a link stands there; the file is as it was.
+    """
+    with open_plain(path, "ab") as file:
+        size = file.tell()
+        text = seal(json.dumps(line), _last_seal(path, size)) + "\n"
+        try:
+            file.write(text.encode("utf-8"))
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            os.ftruncate(file.fileno(), size)
+            raise
+
+
+def _last_seal(path: Path, size: int) -> str:
+    if size == 0:
+        return ""
+    with open_plain(path) as file:
+        file.seek(max(0, size - SEAL_BYTES - 1))
+        found = SEAL.search(file.read().removesuffix(b"\n"))
+        if found is not None:
+            return found.group(1).decode()
+        file.seek(0)
+        return hashlib.sha256(file.read(size)).hexdigest()
 
 
 def drop_cut_line(path: Path) -> None:
-    """Remove a last line that a crash cut off, or the next one would join it."""
-    if not path.is_file():
-        return
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
+    """Remove what a crash cut off, and tell; the next line would join it."""
+    content = _read(path)
+    whole = _whole(content)
     if whole < len(content):
-        with path.open("r+b") as file:
+        _LOG.warning(
+            "%s: its last line was cut off by a crash; %d bytes are removed",
+            path,
+            len(content) - whole,
+        )
+        with open_plain(path, "r+b") as file:
             file.truncate(whole)
 
 
 def keep_lines(path: Path, wanted: Callable[[dict[str, Any]], bool]) -> None:
     """Keep the lines that are wanted, in their order; the file changes in one piece."""
-    if not path.is_file():
-        return
-    drop_cut_line(path)
-    lines = path.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if wanted(json.loads(line))]
+    lines = read_lines(path)
+    kept = [line for line in lines if wanted(line)]
     if len(kept) < len(lines):
-        write_atomic(path, "".join(line + "\n" for line in kept))
+        write_lines(path, kept)
+
+
+def write_lines(path: Path, lines: Iterable[dict[str, Any]]) -> None:
+    """Write a file of sealed lines in one piece."""
+    before = ""
+    with open_atomic(path) as file:
+        for line in lines:
+            text = seal(json.dumps(line), before)
+            before = text[-66:-2]
+            file.write(text.encode("utf-8") + b"\n")

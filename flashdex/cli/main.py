@@ -24,7 +24,7 @@ from flashdex.cli.terminal import (
     say,
     set_up_streams,
 )
-from flashdex.errors import FlashdexError, nearest
+from flashdex.errors import FlashdexError, MissingExtraError, nearest
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -193,7 +193,10 @@ def _doctor(args: argparse.Namespace) -> int:
         from flashdex.cli.doctor import examine, examine_recipe, format_report
 
     if args.recipe is not None:
-        report, fits = examine_recipe(args.recipe, args.overrides)
+        try:
+            report, fits = examine_recipe(args.recipe, args.overrides)
+        except MissingExtraError as error:  # that is an answer, too
+            report, fits = str(error), False
         say(report)
         return int(not fits)
     findings = examine()

@@ -151,7 +151,7 @@ XML = '''<mujoco><worldbody><body name="thing" mocap="true">
 
 class Walled(ScenePainter):
     def _place(self, frame):
-        turn = np.radians([135.0, 225.0, 45.0][frame])  # where the camera looks to
+        turn = np.radians([135.0, 225.0, 45.0, 315.0][frame])  # where the camera looks to
         side = np.array([np.cos(turn), np.sin(turn), 0.0])
         self._data.mocap_pos[:] = [0, 0, 0], -0.06 * side
         self._data.mocap_quat[1] = [np.cos(turn / 2), 0, 0, np.sin(turn / 2)]
@@ -162,7 +162,7 @@ class Walled(ScenePainter):
 
 painter = Walled(mujoco.MjSpec.from_string(XML), size=(128, 96), middle=0)
 red = lambda p: int((p[..., 0] > p[..., 2] + 60.0).sum())
-print([[red(painter.draw(t)), red(painter.draw_still(t))] for t in range(3)])
+print([[red(painter.draw(t)), red(painter.draw_still(t))] for t in range(4)])
 """
 
 

@@ -151,7 +151,7 @@ XML = '''<mujoco><worldbody><body name="thing" mocap="true">
 
 class Walled(ScenePainter):
     def _place(self, frame):
-        turn = np.radians([135.0, 225.0, 45.0, 315.0][frame])  # where the camera looks to
+        turn = np.radians([135.0, 225.0, 45.0, 315.0][frame])
         side = np.array([np.cos(turn), np.sin(turn), 0.0])
         self._data.mocap_pos[:] = [0, 0, 0], -0.06 * side
         self._data.mocap_quat[1] = [np.cos(turn / 2), 0, 0, np.sin(turn / 2)]

@@ -62,8 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _set_up_logging(*, debug: bool) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
-    level = logging.DEBUG if debug else logging.INFO
+    # of other packages only what is wrong: OpenGL reports what it has not found
+    level = logging.DEBUG if debug else logging.WARNING
     logging.basicConfig(level=level, handlers=[handler])
+    logging.getLogger("flashdex").setLevel(min(level, logging.INFO))
 
 
 def _read_arguments(words: list[str]) -> argparse.Namespace:

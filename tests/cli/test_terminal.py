@@ -50,6 +50,24 @@ def test_control_characters_never_reach_the_terminal(capsys):
     assert error.splitlines()[1:] == [r"  1. a\x1b[31mb\x07\r\x9b2J\u202ec\u2028d e"]
 
 
+LOGS = """
+import logging
+from flashdex.cli.main import main
+main(["ls"])
+logging.getLogger("OpenGL.acceleratesupport").info("theirs")
+logging.getLogger("other").warning("wrong")
+logging.getLogger("flashdex.x").info("ours")
+"""
+
+
+def test_of_other_packages_only_warnings_are_shown():
+    _, _, err = run_python(LOGS)
+    assert [line.split()[1:] for line in err.splitlines()] == [
+        ["other:", "wrong"],
+        ["flashdex.x:", "ours"],
+    ]
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
 def test_any_name_can_be_shown_on_any_terminal(encoding, tmp_path):
     (tmp_path / "瓶é\udcff.yaml").write_text("seed: 1")

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flashdex.cli.terminal import loading, number_above, path, say
+from flashdex.cli.interrupt import loading
+from flashdex.cli.terminal import number_above, path, say
 from flashdex.datasets import source_names
 from flashdex.errors import FlashdexError, UnknownHandError, UnknownSourceError
 from flashdex.hands import known_hands

@@ -16,14 +16,8 @@ from pathlib import Path
 
 import flashdex
 from flashdex.cli.data import Handler, add_data_verbs
-from flashdex.cli.terminal import (
-    INTERRUPTED,
-    Formatter,
-    loading,
-    path,
-    say,
-    set_up_streams,
-)
+from flashdex.cli.interrupt import INTERRUPTED, loading
+from flashdex.cli.terminal import Formatter, path, say, set_up_streams
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
 
 
@@ -191,19 +185,26 @@ def _add_run_verbs(
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    with loading():
-        from flashdex.cli.doctor import examine, examine_recipe, format_report
-
     if args.recipe is not None:
+        return _doctor_recipe(args)
+    with loading():
+        from flashdex.cli.doctor import examine, format_report
+
+        findings = examine()
+    say(format_report(findings))
+    return int(any(finding.status == "missing" for finding in findings))
+
+
+def _doctor_recipe(args: argparse.Namespace) -> int:
+    with loading():
+        from flashdex.cli.doctor import examine_recipe
+
         try:
             report, fits = examine_recipe(args.recipe, args.overrides)
         except MissingExtraError as error:  # that is an answer, too
             report, fits = str(error), False
-        say(report)
-        return int(not fits)
-    findings = examine()
-    say(format_report(findings))
-    return int(any(finding.status == "missing" for finding in findings))
+    say(report)
+    return int(not fits)
 
 
 def _ls(args: argparse.Namespace) -> int:

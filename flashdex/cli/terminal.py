@@ -1,4 +1,4 @@
-"""What every verb does with its terminal: print harmlessly, answer Ctrl-C."""
+"""What every verb does with its terminal: print harmlessly, read words."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ import io
 import logging
 import math
 import os
-import signal
 import sys
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 from flashdex.errors import printable
-
-INTERRUPTED = 130  # exit code, as shells have it
 
 
 def say(text: str, *, error: bool = False) -> None:
@@ -41,33 +36,6 @@ class Formatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """See ``logging``."""
         return printable(super().format(record))
-
-
-@contextmanager
-def loading() -> Iterator[None]:
-    """While libraries load, Ctrl-C ends the process at once.
-
-    An import may swallow KeyboardInterrupt, and the verb would go on for hours; nothing
-    is there yet that an orderly end would save. A process that ignores Ctrl-C still
-    does, and a thread of a program that calls ``main`` is left alone.
-    """
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN:
-        yield
-        return
-    try:
-        signal.signal(signal.SIGINT, _leave)
-    except ValueError:  # not the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    os._exit(INTERRUPTED)
 
 
 def path(text: str) -> Path:

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from flashdex.cli.interrupt import INTERRUPTED, loading
 from flashdex.cli.main import main
-from flashdex.cli.terminal import INTERRUPTED, Formatter, loading, say
+from flashdex.cli.terminal import Formatter, say
 from flashdex.errors import RecipeError
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +36,7 @@ def run_python(code, *words, **kept):
     return done.returncode, done.stdout.decode("latin-1"), done.stderr.decode("latin-1")
 
 
-COMMAND = "import sys; from flashdex.cli.main import main; sys.exit(main(sys.argv[1:]))"
+COMMAND = "import sys; from flashdex.cli.__main__ import start; sys.exit(start())"
 
 
 def test_control_characters_never_reach_the_terminal(capsys):
@@ -80,7 +81,7 @@ def test_any_name_can_be_shown_on_any_terminal(encoding, tmp_path):
 
 SWALLOWS = """
 import os, signal, sys
-from flashdex.cli.terminal import loading
+from flashdex.cli.interrupt import loading
 with loading():
     try:
         os.kill(os.getpid(), signal.SIGINT)

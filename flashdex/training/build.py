@@ -53,7 +53,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
             "of a prepared library, or motions.source=procedural."
         )
     folder = Path("libraries") / library_name(recipe)
-    order = _order(recipe)
+    order = make_order(recipe)
     if (folder / "manifest.json").is_file():
         library = MotionLibrary.load(folder)
         try:
@@ -67,7 +67,8 @@ def load_library(recipe: Recipe) -> MotionLibrary:
     return run_order(order, folder)
 
 
-def _order(recipe: Recipe) -> Order:
+def make_order(recipe: Recipe) -> Order:
+    """What a recipe that names a source has prepared: the motions it asks for."""
     motions = recipe.motions
     assert motions.source is not None
     # made-up motions are made by number, and selected from those

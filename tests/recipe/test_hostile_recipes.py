@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import time
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +20,7 @@ from flashdex.recipe.reader import MAX_BYTES, parse_yaml
 from flashdex.recipe.store import list_recipes
 
 GOOD = "defaults: [{motions: procedural}, _self_]\ntotal_env_steps: 1_000_000\n"
+ROOT = Path(__file__).parents[2]
 LETTERS = "bcdefghijk"
 
 
@@ -324,3 +327,16 @@ def test_merging_copies_what_it_is_given():
         "b": {"c": None, "d": 2},
         "e": [1],
     }
+
+
+def test_plugins_in_the_working_folder_are_not_loaded(tmp_path):
+    """Hydra imports every module of the namespace `hydra_plugins` when it composes."""
+    (tmp_path / "hydra_plugins").mkdir()
+    (tmp_path / "hydra_plugins" / "evil.py").write_text("open('ran', 'w').close()")
+    (tmp_path / "mine.yaml").write_text(GOOD)
+    code = "from flashdex.recipe import compose, compose_runs; "
+    code += "compose('mine.yaml', ['seed=1']); compose_runs('mine.yaml', ['seed=1,2'])"
+    paths = os.pathsep.join([str(ROOT), str(tmp_path)])
+    env = {**os.environ, "PYTHONPATH": paths}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, check=True)
+    assert not (tmp_path / "ran").exists()

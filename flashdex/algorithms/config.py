@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flashdex.system.fields import number
 
-Width = Annotated[int, Field(ge=1, le=2**14)]
+Width = Annotated[int, Field(ge=1, le=2**12)]
 """Neurons or channels of a layer."""
 
 

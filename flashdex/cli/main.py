@@ -64,7 +64,10 @@ def _set_up_logging(*, debug: bool) -> None:
 
 def _read_arguments(words: list[str]) -> argparse.Namespace:
     """Read the words after `flashdex`; what is wrong with them ends with 2."""
-    parser, verbs = make_parser()
+    parser = make_parser()
+    verbs = next(
+        list(a.choices) for a in parser._actions if a.dest == "verb" and a.choices
+    )
     first = next((word for word in words if not word.startswith("-")), None)
     if first is not None and first not in verbs:
         known = ", ".join(verbs)
@@ -88,8 +91,8 @@ def _take_overrides(
         args.overrides += rest
 
 
-def make_parser() -> tuple[argparse.ArgumentParser, list[str]]:
-    """Return the parser of all verbs, and their names."""
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of all verbs."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument(
         "--debug", action="store_true", help="tracebacks and more detailed logs"
@@ -120,7 +123,7 @@ def make_parser() -> tuple[argparse.ArgumentParser, list[str]]:
     _add_recipe_verbs(add)
     add_data_verbs(add)
     _add_run_verbs(add)
-    return parser, list(verbs.choices)
+    return parser
 
 
 def _add_allow(verb: argparse.ArgumentParser) -> None:

@@ -28,7 +28,7 @@ class LoopConfig:
     """Seconds between log records."""
     wall_limit_s: float | None = number(None, above=0, high=1e9)
     """Stop cleanly after this many seconds, all sessions together; null = never."""
-    torch_threads: int = number(0, low=0, high=4096)
+    torch_threads: int = number(0, low=0, high=256)
     """Threads of the learner on a CPU; 0 = torch's choice. With small networks more
     threads wait for each other longer than they compute."""
 

@@ -42,7 +42,7 @@ class PhysicsConfig:
     """Solver iterations; certificates use more."""
     ls_iterations: int = number(50, low=1, high=10_000)
     """Line-search iterations."""
-    num_threads: int = number(0, low=0, high=4096)
+    num_threads: int = number(0, low=0, high=256)
     """Threads of the cpu engine; 0 = all cores."""
     nconmax: int | None = number(None, low=1, high=10_000)
     """Contacts a world, warp only; null = four for each geom that moves. All worlds

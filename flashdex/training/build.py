@@ -55,7 +55,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
         )
     folder = Path("libraries") / library_name(recipe)
     order = make_order(recipe)
-    if (library := _load_current(folder)) is not None:
+    if (library := load_current(folder)) is not None:
         try:
             if library.manifest.get("inputs") == hash_inputs(order):
                 return library
@@ -67,7 +67,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
     return run_order(order, folder)
 
 
-def _load_current(folder: Path) -> MotionLibrary | None:
+def load_current(folder: Path) -> MotionLibrary | None:
     """An automatic library; None where there is none of this version."""
     if not (folder / MANIFEST).is_file():
         return None

@@ -13,6 +13,7 @@ from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import MotionsConfig, Recipe
 from flashdex.training import build
 from flashdex.training.build import RunBuilder, library_name, load_library
+from flashdex.training.memory.stand_in import find_library
 
 
 @pytest.fixture
@@ -81,6 +82,9 @@ def test_an_automatic_library_of_an_older_version_is_prepared_again(
     folder = tmp_path / "libraries" / library_name(recipe)
     folder.mkdir(parents=True)
     (folder / "manifest.json").write_text('{"schema": 1, "motions": []}')
+    assert find_library(recipe) is None
+    with pytest.raises(LibraryError, match="schema 1, this version reads 2"):
+        find_library(recipe_of(library=str(folder)))
     made = []
 
     def prepare(order, path):

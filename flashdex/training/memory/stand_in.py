@@ -18,10 +18,10 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.envs.scene.scene import SceneLayout
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.library_format import FRAME_KEYS, NUM_OBJECT_SLOTS
+from flashdex.motions.library_format import FRAME_KEYS, MANIFEST, NUM_OBJECT_SLOTS
 from flashdex.objects.asset import ObjectSettings
 from flashdex.recipe import Recipe
-from flashdex.training.build import library_name, select_motions
+from flashdex.training.build import library_name, load_current, select_motions
 
 # Assumed of motions that are not prepared yet: motions, seconds, support discs.
 MOTIONS, SECONDS, SUPPORTS = 100, 20.0, 4
@@ -94,11 +94,15 @@ def find_library(recipe: Recipe) -> MotionLibrary | None:
     Raises:
         LibraryError: it is broken, or nothing in it is selected.
     """
-    folder = recipe.motions.library
-    path = Path(folder) if folder else Path("libraries") / library_name(recipe)
-    if not (path / "manifest.json").is_file():
+    named = recipe.motions.library
+    path = Path(named or Path("libraries") / library_name(recipe))
+    # one of an older version is prepared again, unless somebody asked for this one
+    if named is None or not (path / MANIFEST).is_file():
+        library = load_current(path)
+    else:
+        library = MotionLibrary.load(path)
+    if library is None:
         return None
-    library = MotionLibrary.load(path)
     empty = TensorDict({}, batch_size=library.frames.batch_size)
     return select_motions(dataclasses.replace(library, frames=empty), recipe)
 

@@ -100,7 +100,7 @@ def map_array(root: Path, name: str, entry: ArrayEntry) -> np.ndarray:
         fault = "is missing"
     except (OSError, ValueError) as error:
         fault = f"cannot be read ({error})"
-    raise RunError(f"{path}: {fault}. It was damaged or changed; make it anew.")
+    raise RunError(f"{path}: {fault}. It was damaged or changed.")
 
 
 def _differs(

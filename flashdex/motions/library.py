@@ -14,7 +14,12 @@ from tensordict import TensorDict
 
 from flashdex.errors import LibraryError, nearest
 from flashdex.motions.library_check import check_all, check_once, map_arrays
-from flashdex.motions.library_format import AGAIN, ARRAYS, read_manifest
+from flashdex.motions.library_format import (
+    AGAIN,
+    ARRAYS,
+    Manifest,
+    read_manifest,
+)
 from flashdex.motions.library_meshes import Mesh, read_mesh
 
 
@@ -67,16 +72,12 @@ class MotionLibrary:
         )
 
     def verify(self) -> list[str]:
-        """Everything that is wrong with the files, read now, whatever is remembered.
+        """Everything that is wrong with the files, read now; see ``verify_library``.
 
-        Empty where nothing is. A changed manifest is told as well.
+        That the manifest is not the one that was opened is told as well.
         """
-        try:
-            manifest = read_manifest(self.path)
-            faults = check_all(self.path, manifest, map_arrays(self.path, manifest))
-        except LibraryError as error:
-            return [str(error)]
-        if manifest.sha256 != self.content_hash:
+        manifest, faults = verify_library(self.path)
+        if manifest is not None and manifest.sha256 != self.content_hash:
             faults.insert(0, "manifest.json: is not the one that was opened")
         return faults
 
@@ -149,6 +150,22 @@ class MotionLibrary:
             data = self.manifest["data"]
             self._meshes[file] = read_mesh(self.path, data, file, digest)
         return self._meshes[file]
+
+
+def verify_library(path: Path) -> tuple[Manifest | None, list[str]]:
+    """Read every file of a library now, whatever is remembered of it.
+
+    Returns:
+        The manifest, None where it cannot be read; and everything that is wrong.
+    """
+    try:
+        manifest = read_manifest(path)
+    except LibraryError as error:
+        return None, [str(error)]
+    try:
+        return manifest, check_all(path, manifest, map_arrays(path, manifest))
+    except LibraryError as error:
+        return manifest, [str(error)]
 
 
 def _parts(arrays: Mapping[str, np.ndarray]) -> list[str]:

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
-from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library import verify_library
 from flashdex.motions.library_format import MANIFEST
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
 from flashdex.replay.disk import check_rows
@@ -127,15 +127,13 @@ def verify(path: str | Path) -> Verification:
 
 
 def _verify_library(path: Path) -> Verification:
-    try:
-        library = MotionLibrary.load(path)
-        faults = library.verify()
-    except FlashdexError as error:
-        return Verification(path, [], [Finding(MANIFEST, "library", str(error))])
-    arrays, meshes = (len(library.manifest[part]) for part in ("arrays", "meshes"))
+    manifest, faults = verify_library(path)
+    if manifest is None or faults:
+        findings = [Finding(str(path), "library", fault) for fault in faults]
+        return Verification(path, [], findings)
+    arrays, meshes = len(manifest.arrays), len(manifest.meshes)
     files = [MANIFEST, f"{arrays} arrays", f"{meshes} meshes"]
-    findings = [Finding(str(path), "library", fault) for fault in faults]
-    return Verification(path, [] if faults else files, findings)
+    return Verification(path, files, [])
 
 
 def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:

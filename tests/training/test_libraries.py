@@ -13,6 +13,7 @@ from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import MotionsConfig, Recipe
 from flashdex.training import build
 from flashdex.training.build import RunBuilder, library_name, load_library
+from flashdex.training.loaded import verify
 from flashdex.training.memory.stand_in import find_library
 
 
@@ -104,3 +105,14 @@ def test_a_selection_keeps_the_hashes_of_its_motions(library):
     wanted = [library.row(name) for name in part.names]
     assert [part.motion_hash(i) for i in range(2)] == [whole[i] for i in wanted]
     assert part.content_hash == library.content_hash
+
+
+def test_verify_tells_each_fault_of_a_library(copy):
+    assert verify(copy).findings == []
+    (mass,) = copy.glob("data-*/objects/mass.npy")
+    content = bytearray(mass.read_bytes())
+    content[-1] ^= 1
+    mass.write_bytes(content)
+    told = "\n".join(str(finding) for finding in verify(copy).findings)
+    assert "objects/mass: was changed" in told
+    assert verify(copy).files == []

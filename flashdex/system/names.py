@@ -63,6 +63,18 @@ def check_names(names: Iterable[Any], *, what: str, where: str = "") -> list[str
     return checked
 
 
+def plain_name(name: str, *, limit: int = NAME_BYTES) -> str:
+    """The nearest name: what one may not hold is "_", what is too long is cut.
+
+    Example:
+        >>> plain_name("s1/mug"), plain_name("")
+        ('s1_mug', '_')
+    """
+    text = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
+    text = text.encode("utf-8")[:limit].decode("utf-8", errors="ignore")
+    return text if not _fault(text) else f"_{text.strip('. ')}"
+
+
 def _fault(name: Any) -> str:
     if not isinstance(name, str):
         return f"it is of type {type(name).__name__}"

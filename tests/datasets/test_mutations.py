@@ -287,9 +287,10 @@ def test_objects_of_any_name_stay_inside_the_library(tmp_path, shared):
     meshes = [
         p for o in library.manifest["objects"] for p in (o["visual"], *o["parts"])
     ]
+    data = library.path / library.manifest["data"]
     root = os.path.realpath(library.path)
-    assert all(os.path.realpath(library.path / m).startswith(root) for m in meshes)
-    assert all((library.path / m).is_file() for m in meshes)
+    assert all(os.path.realpath(data / m).startswith(root) for m in meshes)
+    assert all((data / m).is_file() for m in meshes)
     assert "'=1+2" in (library.path / "report.csv").read_text()
     written = {p for p in tmp_path.rglob("*") if p not in before}
     ours = [p.relative_to(tmp_path).parts[0] in ("out", "cache") for p in written]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from flashdex.errors import LibraryError
+from flashdex.errors import FlashdexError, LibraryError
 from flashdex.motions.library_format import (
     AGAIN,
     ARRAYS,
@@ -254,7 +254,7 @@ def _mark(path: Path, manifest: Manifest) -> Path | None:
             # an edit that sets the time back has another time of change
             times = found.st_mtime_ns, found.st_ctime_ns
             stamps.append([found.st_dev, found.st_ino, found.st_size, *times])
-    except (OSError, RuntimeError):  # a file is missing, or there is no home
+    except (OSError, FlashdexError):  # a file is missing, or there is no home
         return None
     return root / "libraries" / hash_json([CHECK_VERSION, manifest.sha256, stamps])
 

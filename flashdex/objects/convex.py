@@ -13,6 +13,8 @@ from scipy.spatial import ConvexHull, QhullError
 from flashdex.errors import MeshError
 from flashdex.geometry.points import farthest_point_sampling
 from flashdex.objects.bodies import bounds_volume, fault_of_mass
+from flashdex.objects.decompose import run_coacd
+from flashdex.system.limited import LimitError
 
 logger = logging.getLogger(__name__)
 
@@ -60,24 +62,22 @@ def compute_convex_parts(
 def _run_coacd(
     mesh: trimesh.Trimesh, max_parts: int, threshold: float, seed: int, name: str
 ) -> list[NDArray[np.float64]]:
-    import coacd  # loads a native library; only needed when nothing is cached
-
-    coacd.set_log_level("off")
     try:
-        parts = coacd.run_coacd(
-            coacd.Mesh(mesh.vertices, mesh.faces),
+        parts = run_coacd(
+            np.asarray(mesh.vertices),
+            np.asarray(mesh.faces),
             threshold=threshold,
             max_convex_hull=max_parts,
             mcts_iterations=SEARCH_ITERATIONS,
             seed=seed,
         )
-    except RuntimeError as error:
+    except LimitError as error:
         logger.warning("%s: CoACD failed (%s); one convex hull instead", name, error)
         return []
     if len(parts) > max_parts:
         logger.warning("%s: more than %d parts; one convex hull", name, max_parts)
         return []
-    return [vertices for vertices, _ in parts]
+    return parts
 
 
 def _reduce_hull(

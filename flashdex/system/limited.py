@@ -13,8 +13,8 @@ from typing import Any
 
 from flashdex.errors import FlashdexError
 
-GRACE = 5.0  # s of wall time above the CPU time: a loaded machine starts slowly
-TOO_MUCH_CPU = (-signal.SIGXCPU, -signal.SIGKILL) if hasattr(signal, "SIGXCPU") else ()
+# wall time for each second of CPU time, and s beside: other programs run, too
+WALL, GRACE = 3.0, 5.0
 # The limits stand before anything is imported. What C code prints goes nowhere, and
 # nothing but JSON comes back: whatever happens in there, nothing of it is executed.
 BOOT = """
@@ -33,13 +33,19 @@ else:
         kind = getattr(resource, "RLIMIT_" + name)
         hard = resource.getrlimit(kind)[1]
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (most, most))
+        # the hard limit of the time would kill as the system does for want of memory
+        resource.setrlimit(kind, (most, hard if name == "CPU" else most))
 import importlib
-function = getattr(importlib.import_module(task["module"]), task["function"])
 try:
+    function = getattr(importlib.import_module(task["module"]), task["function"])
     out = {"value": function(*task["args"])}
 except MemoryError:
     out = {"memory": True}
+except ImportError:
+    out = {"error": "it cannot load its libraries, as for want of memory"}
+    out["memory"] = True
+except OSError as error:
+    out = {"error": f"{type(error).__name__}: {error}"[:1000], "memory": True}
 except Exception as error:
     out = {"error": f"{type(error).__name__}: {error}"[:1000]}
 os.write(answer, json.dumps(out).encode())
@@ -48,7 +54,16 @@ os._exit(0)
 
 
 class LimitError(FlashdexError):
-    """What was tried apart failed there, took too much, or ended its process."""
+    """What was tried apart failed there, took too much, or ended its process.
+
+    Attributes:
+        is_machine: it crashed, or memory or the disk failed: not by itself a fault of
+            the content; another time it may go well.
+    """
+
+    def __init__(self, text: str, *, is_machine: bool = False) -> None:
+        super().__init__(text)
+        self.is_machine = is_machine
 
 
 def run_limited(
@@ -63,7 +78,7 @@ def run_limited(
         function: of a module's top level; its arguments and its value are JSON.
         args: its arguments.
         memory: address space of the child, bytes, what it imports included.
-        seconds: of CPU time; the wall time may be five seconds longer.
+        seconds: of CPU time; the wall time may be three times as long.
 
     Raises:
         LimitError: it raised, took too much, or crashed; the text says which.
@@ -77,7 +92,7 @@ def run_limited(
         "seconds": seconds,
     }
     # one arena: every thread would reserve 64 MB of address space otherwise
-    env = {**os.environ, "MALLOC_ARENA_MAX": "1", "OMP_NUM_THREADS": "1"}
+    env = {**os.environ, "MALLOC_ARENA_MAX": "1"}
     try:
         done = subprocess.run(
             # isolated, without site: its path is ours, not that of the folder we are in
@@ -85,7 +100,7 @@ def run_limited(
             input=json.dumps(task).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            timeout=seconds + GRACE,
+            timeout=WALL * seconds + GRACE,
             cwd=tempfile.gettempdir(),
             env=env,
             start_new_session=True,  # Ctrl-C is ours to answer
@@ -99,15 +114,19 @@ def run_limited(
 def _value_of(
     done: subprocess.CompletedProcess[bytes], *, memory: int, seconds: int
 ) -> Any:
-    if done.returncode in TOO_MUCH_CPU:
+    if done.returncode == -getattr(signal, "SIGXCPU", 0) != 0:
         raise LimitError(f"it took more than {seconds} s")
+    if done.returncode == -getattr(signal, "SIGKILL", 0) != 0:
+        raise LimitError("the system ended it, as for want of memory", is_machine=True)
     try:
         out = json.loads(done.stdout)
     except ValueError:
         text = f"it ended the process that tried it (code {done.returncode})"
-        raise LimitError(f"{text}, as a crash or want of memory does") from None
-    if "memory" in out:
-        raise LimitError(f"it needs more than {memory / 2**30:.1f} GiB of memory")
+        text += ", as a crash or want of memory does"
+        raise LimitError(text, is_machine=True) from None
     if "error" in out:
-        raise LimitError(out["error"])
+        raise LimitError(out["error"], is_machine="memory" in out)
+    if "memory" in out:
+        text = f"it needs more than {memory / 2**30:.1f} GiB of memory"
+        raise LimitError(text, is_machine=True)
     return out["value"]

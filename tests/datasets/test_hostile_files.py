@@ -175,7 +175,9 @@ def test_names_do_not_steer_the_terminal(tmp_path, capsys):
     np.savez(tmp_path / "a\x1b[2Jb.npz", object="box")
     words = ["prepare", "--dry-run", "--source", "keypoints", "--input", str(tmp_path)]
     assert main(words) == 0
-    assert "a?[2Jb  1 files" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert r"a\x1b[2Jb  1 files" in out
 
 
 def test_fetch_into_a_file_is_refused(tmp_path):

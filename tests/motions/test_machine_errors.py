@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from flashdex.datasets import list_recordings
 from flashdex.datasets.procedural.reader import procedural
@@ -13,6 +14,7 @@ from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError, MeshError, is_of_machine
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.workers import Job, run_job
+from flashdex.objects import decompose
 from flashdex.objects.asset import ObjectSettings, make_object
 from flashdex.objects.meshes import load_mesh
 
@@ -81,13 +83,10 @@ def test_a_mesh_is_not_called_broken_when_the_machine_is(tmp_path, fail_once, fa
 def test_an_object_is_not_made_of_one_hull_when_the_machine_fails(
     tmp_path, monkeypatch, failure
 ):
-    import coacd
-    import trimesh
-
     def fails(*_, **__):
         raise failure
 
-    monkeypatch.setattr(coacd, "run_coacd", fails)
+    monkeypatch.setattr(decompose, "run_limited", fails)
     torus = trimesh.creation.torus(0.04, 0.01, major_sections=12, minor_sections=8)
     with pytest.raises(type(failure)):
         make_object(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flashdex.errors import MeshError
+from flashdex.errors import FlashdexError, MeshError
 from flashdex.objects.asset import ObjectSettings, default_cache_dir, make_object
 from flashdex.objects.meshes import clean_mesh, load_mesh, reduce_mesh
 from flashdex.objects.signed_distance import winding_number
@@ -291,6 +291,36 @@ def test_damaged_cache_file_is_computed_again(tmp_path, caplog, damage):
     assert not caplog.text
     assert [p.name for p in tmp_path.rglob("*.npz")] == [file.name]
     assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_links_planted_in_the_cache_are_not_followed(tmp_path):
+    mesh = trimesh.creation.box(extents=(0.05, 0.05, 0.05))
+    first = make_object(mesh, settings=SMALL, cache_dir=tmp_path)
+    (file,) = tmp_path.rglob("*.npz")
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    file.unlink()
+    for name in (
+        file.name,
+        f".{file.name}.lock",
+        f".{file.name}.{os.getpid()}.tmp",
+    ):
+        file.with_name(name).unlink(missing_ok=True)
+        file.with_name(name).symlink_to(mine)
+    assert_same(first, make_object(mesh, settings=SMALL, cache_dir=tmp_path))
+    assert mine.read_text() == "mine"
+    assert not file.is_symlink()
+
+
+def test_no_home_is_one_message(monkeypatch):
+    monkeypatch.delenv("FLASHDEX_CACHE", raising=False)
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.raises(FlashdexError, match="set FLASHDEX_CACHE"):
+        default_cache_dir()
 
 
 def test_unwritable_cache_only_warns(tmp_path, caplog):

@@ -14,6 +14,7 @@ from flashdex.datasets.files import read_json, refuse_clone, refuse_pointer, tol
 from flashdex.datasets.hot3d.files import FrameAxis, Track, read_lines
 from flashdex.datasets.roots import listed, on_disk
 from flashdex.errors import DemoError
+from flashdex.system.files import hash_file
 
 Up = Literal["z", "y"]
 # Aria: origin near the first headset position; Quest: origin on the floor
@@ -150,9 +151,9 @@ class ObjectLibrary:
             return {uid: str(body["instance_name"]) for uid, body in found.items()}
 
     def key(self) -> str:
-        """Names and sizes of all models, as text: changes when one is added."""
+        """Names and content of all models, as text: changes when one does."""
         models = [f for f in listed(self.folder, "*.glb") if f.is_file()]
-        return " ".join(f"{file.name}:{file.stat().st_size}" for file in models)
+        return " ".join(f"{file.name}:{hash_file(file)}" for file in models)
 
 
 def find_library(root: Path, given: Path | None) -> ObjectLibrary:

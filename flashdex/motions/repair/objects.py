@@ -35,32 +35,44 @@ def settle_objects(demo: HumanDemo) -> tuple[HumanDemo, list[Finding]]:
         body.pose.shape[1:] != (7,) for body in demo.objects
     ):
         return demo, []  # of a wrong shape, which validation tells
-    used, found, kept = set(demo.hand_object.values()), [], []
-    bodies, shifts = list(demo.objects), {}
+    used = set(demo.hand_object.values())
+    bodies, shifts, kept, found = list(demo.objects), {}, [], []
     for place, body in enumerate(demo.objects):
+        is_needed = place in used or len(demo.objects) == 1 or has_moved(body.pose)
         try:
-            mesh = body.load_mesh()
+            bodies[place], shift = _settled(body)
         except MeshError as error:
-            if place in used or has_moved(body.pose) or len(demo.objects) == 1:
+            if is_needed:
                 kept.append(place)
                 continue
             text = f"object '{body.name}', which never moves, left out: {error.text}"
             found.append(warn("E_MESH", text))
             continue
         kept.append(place)
-        bodies[place] = replace(body, mesh=mesh)
-        if (shift := _far_centre(mesh)) is not None:
-            bodies[place] = _shifted(bodies[place], mesh, shift)
+        if shift is not None:
             shifts[body.name] = shift.round(6).tolist()
-            away = float(np.linalg.norm(shift))
-            text = f"the mesh of '{body.name}' lies {away:.2f} m from the origin of its"
-            text += " frame; both were moved, so that errors are measured at its centre"
-            found.append(warn("W_ORIGIN", text))
+            text = f"the mesh of '{body.name}' lies {np.linalg.norm(shift):.2f} m from "
+            text += "the origin of its frame; both were moved, so that errors are "
+            found.append(warn("W_ORIGIN", f"{text}measured at its centre"))
     if not kept:
         return demo, []
     told = demo.provenance | ({"mesh_shift": shifts} if shifts else {})
     demo = replace(demo, objects=bodies, provenance=told)
     return keep(demo, list(demo.keypoints), kept), found
+
+
+def _settled(body: DemoObject) -> tuple[DemoObject, np.ndarray | None]:
+    """An object with its mesh, near its frame; and by what both were moved, m, (3,)."""
+    mesh = body.load_mesh()
+    shift = _far_centre(mesh)
+    if shift is None:
+        return replace(body, mesh=mesh), None
+    pose = body.pose.copy()
+    seen = ~missing_frames(pose)
+    if seen.any():
+        pose[seen, :3] += rotation(pose[seen, 3:]).apply(shift)
+    mesh = trimesh.Trimesh(mesh.vertices - shift, mesh.faces, process=False)
+    return replace(body, mesh=mesh, pose=pose), shift
 
 
 def _far_centre(mesh: trimesh.Trimesh) -> np.ndarray | None:
@@ -70,12 +82,3 @@ def _far_centre(mesh: trimesh.Trimesh) -> np.ndarray | None:
     low, high = mesh.bounds
     away = np.linalg.norm(np.maximum(low, 0) + np.minimum(high, 0))
     return (low + high) / 2 if away > FAR else None
-
-
-def _shifted(body: DemoObject, mesh: trimesh.Trimesh, shift: np.ndarray) -> DemoObject:
-    pose = body.pose.copy()
-    seen = ~missing_frames(pose)
-    if seen.any():
-        pose[seen, :3] += rotation(pose[seen, 3:]).apply(shift)
-    mesh = trimesh.Trimesh(mesh.vertices - shift, mesh.faces, process=False)
-    return replace(body, mesh=mesh, pose=pose)

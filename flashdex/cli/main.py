@@ -65,9 +65,7 @@ def _set_up_logging(*, debug: bool) -> None:
 def _read_arguments(words: list[str]) -> argparse.Namespace:
     """Read the words after `flashdex`; what is wrong with them ends with 2."""
     parser = make_parser()
-    verbs = next(
-        list(a.choices) for a in parser._actions if a.dest == "verb" and a.choices
-    )
+    (verbs,) = (list(a.choices or ()) for a in parser._actions if a.dest == "verb")
     first = next((word for word in words if not word.startswith("-")), None)
     if first is not None and first not in verbs:
         known = ", ".join(verbs)
@@ -253,7 +251,7 @@ def _train(args: argparse.Namespace) -> int:
         from flashdex.training.run_dir import train
 
     for recipe in recipes:
-        if not _show_run(train(recipe)):
+        if not _show_run(train(recipe, args.overrides)):
             break
     return 0
 
@@ -299,15 +297,19 @@ def _evaluate(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     with loading():
         from flashdex.recipe import require_motions
-        from flashdex.reports.run.terminal import replay_line
+        from flashdex.reports.run.terminal import finding_lines, replay_line
 
         require_motions(args.run_dir)
-        from flashdex.rollouts.replay import replay
+        from flashdex.rollouts.verify import verify_run
+        from flashdex.training.loaded import open_truth
 
-    replayed = replay(args.run_dir)
-    for one in replayed:
+    truth, why = open_truth(args.run_dir)
+    verified = verify_run(args.run_dir, truth)
+    for one in verified.rollouts:
         say(replay_line(one.motion, one.stored, one.found, holds=one.holds))
-    return 0 if all(one.holds for one in replayed) else 1
+    for line in finding_lines(verified.findings, why):
+        say(line)
+    return 0 if verified.holds else 1
 
 
 def _score(args: argparse.Namespace) -> int:
@@ -315,16 +317,21 @@ def _score(args: argparse.Namespace) -> int:
     if absent:
         raise FlashdexError(f"{', '.join(absent)}: there is no such file")
     with loading():
-        from flashdex.reports.run.terminal import score_table
+        from flashdex.reports.run.terminal import finding_lines, score_table
         from flashdex.rollouts.rollout import Rollout
+        from flashdex.rollouts.verify import faults, verify_file
 
     found = {str(file): Rollout.load(file).score() for file in args.files}
+    findings = {str(file): verify_file(file) for file in args.files}
     if args.json:
         plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
         say(json.dumps(plain, indent=1))
     else:
         say("\n\n".join(score_table(f, s) for f, s in found.items()))
-    return 0
+    every = [finding for some in findings.values() for finding in some]
+    for line in finding_lines(every):
+        say(line, error=args.json)
+    return 1 if faults(every) else 0
 
 
 def _report(args: argparse.Namespace) -> int:

@@ -3,7 +3,14 @@
 import pytest
 
 from flashdex.errors import FlashdexError
-from flashdex.system.names import NAME_BYTES, STEM, check_name, check_names, file_stem
+from flashdex.system.names import (
+    NAME_BYTES,
+    STEM,
+    check_name,
+    check_names,
+    file_stem,
+    plain_name,
+)
 
 BAD = {
     "parent": "../evil",
@@ -69,3 +76,18 @@ def test_two_names_that_would_share_a_file_are_refused():
     for pair in (["lift", "lift"], ["Lift", "lift"], ["a b", taken]):
         with pytest.raises(FlashdexError, match="would be the same"):
             check_names(pair, what="motion")
+
+
+@pytest.mark.parametrize(
+    "found",
+    ["../evil", "", "..", " ", "a/b\\c", "a\0b\n", "half \ud800", "é" * 300, "\x1b[2J"],
+    ids=ascii,
+)
+def test_any_text_has_a_name_near_it(found):
+    name = plain_name(found)
+    assert check_name(name, what="motion") == name
+    assert plain_name(name) == name
+
+
+def test_a_name_is_its_own_nearest():
+    assert plain_name("päck aus (2)") == "päck aus (2)"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,10 +11,29 @@ from typing import Any
 from flashdex.errors import RecipeError, RunError, UnknownNameError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
-from flashdex.recipe.reader import read_yaml
+from flashdex.recipe.reader import parse_yaml
+from flashdex.system.files import own_files
+from flashdex.system.jsonl import Schema, read_lines, read_object
+from flashdex.system.run_files import (
+    BASELINES,
+    CONVERSIONS,
+    RECIPE,
+    ROLLOUTS,
+    VERSIONS,
+    check_run,
+    check_sessions,
+    read_metrics,
+    read_recipe,
+)
 
 Line = dict[str, Any]
-ATTEMPT_KEYS = ("motion", "converted", "errors", "env_steps", "wall_s")
+ATTEMPT: Schema = {
+    "motion": str,
+    "converted": bool,
+    "errors": dict,
+    "env_steps": int,
+    "wall_s": float,
+}
 
 
 @dataclass(frozen=True)
@@ -63,59 +81,46 @@ def load_run(run_dir: str | Path) -> RunData:
         RunError: this is no run directory, or a file in it is broken.
     """
     path = Path(run_dir)
-    recipe = path / "recipe.yaml"
-    if not recipe.is_file():
-        raise RunError(
-            f"{path}: not a run directory, there is no recipe.yaml in it. Give the "
-            "folder that 'flashdex train' wrote, usually runs/<name>."
-        )
+    text = read_recipe(path)  # refuses what is none, or was changed
+    check_run(path)
+    check_sessions(path)
     try:
-        composed = read_yaml(recipe)
+        composed = parse_yaml(text, where=str(path / RECIPE))
     except RecipeError as error:
         raise RunError(f"{error}\nRestore the file.") from error
     return RunData(
         path=path,
         recipe=composed,
-        versions=_read_json(path / "versions.json"),
-        metrics=_drop_repeated(
-            _read_lines(path / "metrics.jsonl", needs=("env_steps",))
-        ),
-        attempts=_read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
-        baselines=_read_json(path / "baselines.json"),
-        certificates=_certificates(path / "rollouts"),
+        versions=read_object(path, VERSIONS),
+        metrics=_drop_repeated(read_metrics(path)),
+        attempts=read_lines(path / CONVERSIONS, ATTEMPT),
+        baselines=_baselines(path),
+        certificates=_certificates(path),
     )
 
 
-def _read_json(path: Path) -> Line:
-    """A JSON object; a file that does not exist is an empty one."""
-    if not path.is_file():
-        return {}
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RunError(f"{path}: not JSON ({error}). Restore or remove it.") from error
-    if not isinstance(found, dict):
-        raise RunError(f"{path}: not a JSON object. Restore or remove it.")
-    return found
+def _baselines(path: Path) -> dict[str, dict[str, Line]]:
+    """Scores by baseline and motion.
 
-
-def _read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
-    """JSON lines with these keys; a last line that a crash cut off is left out."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    found = []
-    for number, text in enumerate(lines, start=1):
-        where = f"{path}: line {number}"
-        try:
-            line = json.loads(text)
-        except ValueError as error:
-            if number == len(lines):
-                break
-            fault = f"{where} is not JSON ({error}). Remove the line."
-            raise RunError(fault) from error
-        absent = [key for key in needs if not isinstance(line, dict) or key not in line]
-        if absent:
-            raise RunError(f"{where} lacks {', '.join(absent)}. Remove the line.")
-        found.append(line)
+    Raises:
+        RunError: the file says something else.
+    """
+    found = read_object(path, BASELINES)
+    rows = [
+        row
+        for motions in found.values()
+        if isinstance(motions, dict)
+        for row in motions.values()
+    ]
+    if not all(isinstance(m, dict) for m in found.values()) or not all(
+        isinstance(row, dict)
+        and isinstance(row.get("errors", {}), dict)
+        and all(type(v) in (int, float) for v in row.get("errors", {}).values())
+        for row in rows
+    ):
+        raise RunError(
+            f"{path / BASELINES}: holds no scores of baselines. Restore or remove it."
+        )
     return found
 
 
@@ -128,12 +133,13 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
     return kept[::-1]
 
 
-def _certificates(folder: Path) -> dict[str, Line]:
+def _certificates(run_dir: Path) -> dict[str, Line]:
     found = {}
-    for path in sorted(folder.glob("*.certificate.json")):
-        certificate = _read_json(path)
-        name = certificate.get("identity", {}).get("motion")
-        found[name or path.name.removesuffix(".certificate.json")] = certificate
+    for path in own_files(run_dir, ROLLOUTS, "*.certificate.json"):
+        certificate = read_object(run_dir, ROLLOUTS, path.name)
+        identity = certificate.get("identity")
+        name = identity.get("motion") if isinstance(identity, dict) else None
+        found[str(name or path.name.removesuffix(".certificate.json"))] = certificate
     return found
 
 
@@ -143,6 +149,8 @@ SHOWN = {
     "object_pos": ("object", "mm", 1e3),
     "object_pos_centred": ("object centred", "mm", 1e3),
     "object_rot": ("object", "deg", 57.29577951308232),
+    "lift": ("lift off by", "x", 1.0),
+    "path": ("path off by", "x", 1.0),
     "fingertip": ("fingertips", "mm", 1e3),
     "joint": ("joints", "mm", 1e3),
     "wrist_pos": ("wrists", "mm", 1e3),
@@ -165,8 +173,21 @@ class MotionFacts:
 
     @cached_property
     def first(self) -> Line | None:
-        """Ledger line of the first conversion."""
-        return next((line for line in self.lines if line.get("converted")), None)
+        """Ledger line of the first conversion; one that is not trivial, if any."""
+        passed = [line for line in self.lines if line.get("converted")]
+        real = (line for line in passed if not line.get("trivial"))
+        return next(real, passed[0] if passed else None)
+
+    @property
+    def ratios(self) -> tuple[float | None, float | None]:
+        """Lift and path of the object over those of the recording, of ``errors``."""
+        line = self.first or self._best or {}
+        return line.get("lift_ratio"), line.get("path_ratio")
+
+    @cached_property
+    def _best(self) -> Line | None:
+        found = [line for line in self.lines if line.get("errors")]
+        return min(found, key=lambda line: _error_size(line["errors"]), default=None)
 
     @property
     def is_converted(self) -> bool:
@@ -176,10 +197,7 @@ class MotionFacts:
     @cached_property
     def errors(self) -> dict[str, float]:
         """Of the first conversion, else of the best complete attempt; m and rad."""
-        if self.first:
-            return self.first["errors"]
-        found = [line["errors"] for line in self.lines if line.get("errors")]
-        return min(found, key=_error_size, default={})
+        return (self.first or self._best or {}).get("errors", {})
 
     @property
     def hands(self) -> tuple[str, ...]:
@@ -193,11 +211,11 @@ class MotionFacts:
 
     @property
     def trivial(self) -> list[str]:
-        """Baselines without learning that pass already."""
+        """Why a conversion counts for little: baselines that pass, hardly a motion."""
         scores = self.baselines.items()
         criterion = self.run.criterion
         passing = [b for b, row in scores if criterion in row.get("passed", [])]
-        named = [b for line in self.lines for b in line.get("trivial") or []]
+        named = (self.first or {}).get("trivial") or []
         return list(dict.fromkeys([*passing, *named]))
 
     @property
@@ -283,13 +301,14 @@ def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
 
 
 def count(facts: list[MotionFacts]) -> dict[str, int]:
-    """Converted motions, and how many of them are certified, robust, trivial."""
-    converted = [f for f in facts if f.is_converted]
+    """Conversions that are not trivial, how many of them hold, and trivial ones."""
+    passed = [f for f in facts if f.is_converted]
+    converted = [f for f in passed if not f.trivial]
     return {
         "converted": len(converted),
         "certified": sum(f.verdict in PROVEN for f in converted),
         "robust": sum(f.verdict == "robust" for f in converted),
-        "trivial": sum(bool(f.trivial) for f in converted),
+        "trivial": len(passed) - len(converted),
         "attempts": sum(len(f.lines) for f in facts),
     }
 

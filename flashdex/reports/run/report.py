@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from flashdex.errors import RunError
@@ -21,8 +22,10 @@ from flashdex.reports.run.facts import (
     num_motions,
 )
 from flashdex.reports.text import NOTHING, number
+from flashdex.rollouts.ledger import rollout_name
+from flashdex.system.files import own_file
+from flashdex.system.run_files import REPORT
 
-REPORT = "report.html"
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
 BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
 Cell = tuple[str, str]  # text, and "good" or "bad" where it is marked
@@ -35,6 +38,8 @@ def write_report(run_dir: str | Path) -> Path:
         RunError: this is no run directory, or it cannot be written.
     """
     run = load_run(run_dir)
+    if not os.access(run.path, os.W_OK):  # said before films are drawn
+        raise RunError(f"{run.path}: cannot be written, so there is no {REPORT}.")
     rows = motion_facts(run)
     total = num_motions(run, rows)
     stored = _stored_rollouts(run, rows)
@@ -43,7 +48,7 @@ def write_report(run_dir: str | Path) -> Path:
     films = [
         (row, film)
         for row in rows
-        if row.name in stored and (film := Film.of(stored[row.name])).video.is_file()
+        if row.name in stored and (film := Film.of(stored[row.name])).is_whole
     ]
     return write_page(
         run.path / REPORT,
@@ -90,12 +95,12 @@ def _promises(run: RunData) -> list[str]:
 
 
 def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
-    """Rollout file of each conversion; a path that leaves the run is not followed."""
+    """Rollout file of each conversion, where its line names one: only its own."""
     found = {}
     for row in rows:
         named = (row.first or {}).get("rollout")
         if named:
-            path = run.path / "rollouts" / Path(named).name
+            path = own_file(run.path, rollout_name(row.name))
             if path.is_file():
                 found[row.name] = path
     return found
@@ -124,6 +129,8 @@ def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
         "env steps": (f"{first['env_steps']:,}" if first else NOTHING, ""),
         "minutes": (number(first["wall_s"] / 60) if first else NOTHING, ""),
         **errors,
+        "lift ratio": (number(row.ratios[0], 2), ""),
+        "path ratio": (number(row.ratios[1], 2), ""),
         "certificate": _verdict(row),
         "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
         "penetration mm": (number(depth), ""),

@@ -16,11 +16,11 @@ from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
-from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
+from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.files import own_file
-from flashdex.system.run_files import read_metrics
+from flashdex.system.run_files import read_metrics, rollout_name
 from flashdex.training.build import RunBuilder
 from flashdex.training.memory.stand_in import find_library
 from flashdex.training.run_dir import load_learner, load_run_recipe

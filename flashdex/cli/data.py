@@ -169,7 +169,7 @@ def _list_recordings(order: Order) -> int:
 
 def _baselines(args: argparse.Namespace) -> int:
     if args.out is not None:
-        _forget(args.out)
+        _check_writable(args.out)
     with loading():
         from flashdex.recipe import Recipe, compose, expect_kind
         from flashdex.training.baselines import format_baselines, score_baselines
@@ -177,18 +177,19 @@ def _baselines(args: argparse.Namespace) -> int:
 
         recipe = compose(args.recipe, args.overrides)
     bench = RunBuilder.from_recipe(expect_kind(recipe, Recipe, where="baselines"))
+    if args.out is not None:
+        args.out.unlink(missing_ok=True)  # scores of another time are no answer
     say(format_baselines(score_baselines(bench, args.out)))
     return 0
 
 
-def _forget(path: Path) -> None:
-    """Remove the scores of another time, and say at once what cannot be written."""
-    try:
-        path.unlink(missing_ok=True)
-        path.touch()
-        path.unlink()
-    except OSError as error:
+def _check_writable(path: Path) -> None:
+    """Say before the work that a file cannot be written; nothing is changed."""
+    fault = "a folder" if path.is_dir() else ""
+    if not os.access(path if path.is_file() else path.parent, os.W_OK):
+        fault = "may not" if path.parent.is_dir() else f"there is no {path.parent}"
+    if fault:
         raise FlashdexError(
-            f"--out: {path} cannot be written ({error.strerror}). Give a file in a "
-            "folder that is there."
-        ) from error
+            f"--out: {path} cannot be written ({fault}). Give a file in a folder that "
+            "is there."
+        )

@@ -19,10 +19,9 @@ from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.system.names import check_name, check_names, file_stem
+from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
 
 _LOG = logging.getLogger(__name__)
-CONVERSIONS = "conversions.jsonl"
-ROLLOUTS = "rollouts"
 UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
 # what a line holds, of any version
 LINE: dict[str, type | tuple[type, ...]] = {
@@ -63,11 +62,6 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
                     "to this file; restore it from a copy."
                 )
     return lines
-
-
-def rollout_name(motion: str) -> str:
-    """Where a run keeps the rollout of a motion: the only place a line may name."""
-    return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
 
 
 def certificate_name(motion: str) -> str:

@@ -34,7 +34,7 @@ from flashdex.system.jsonl import (
     read_object,
     write_object,
 )
-from flashdex.system.machine import source_changes, versions
+from flashdex.system.names import check_name, file_stem
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,6 +62,11 @@ _HALF = re.compile(r"\.(.+)\.\d+\.tmp")  # what a killed process left half writt
 _COUNTERS: Schema = {"env_steps": int, "wall_s": float}
 STARTED: Schema = {**_COUNTERS, "env_steps_lost": int, "overrides": list, "date": str}
 ENDED: Schema = {**_COUNTERS, "why": str, "date": str}
+
+
+def rollout_name(motion: str) -> str:
+    """Where a run keeps the rollout of a motion: the only place a line may name."""
+    return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
 
 
 def check_run(run_dir: Path) -> None:
@@ -124,6 +129,9 @@ def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
         check_run(run_dir)
         refuse_old_run(run_dir)  # another process may have just ended one
         with reported(run_dir):
+            # loads torch, which what only reads a run can do without
+            from flashdex.system.machine import versions
+
             write_object({"run": uuid.uuid4().hex, **versions()}, run_dir, VERSIONS)
             _keep_changes(run_dir)
             write_recipe(run_dir, recipe)
@@ -139,6 +147,8 @@ def write_recipe(run_dir: Path, recipe: str) -> None:
 def _keep_changes(run_dir: Path) -> None:
     """Store what was not committed; a run does not need it."""
     try:
+        from flashdex.system.machine import source_changes
+
         if diff := source_changes():
             with open_own(run_dir, DIFF) as file:
                 file.write(diff)

@@ -21,7 +21,7 @@ from flashdex.motions.library_format import MANIFEST
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
 from flashdex.replay.disk import check_rows
 from flashdex.rollouts.findings import Finding
-from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
+from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.rollouts.verify import Verified, verify_run
@@ -42,6 +42,7 @@ from flashdex.system.run_files import (
     check_sessions,
     read_metrics,
     read_recipe,
+    rollout_name,
 )
 from flashdex.training.build import RunBuilder
 from flashdex.training.checkpoint import (

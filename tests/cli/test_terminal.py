@@ -227,3 +227,14 @@ def test_cp_never_writes_over_anything(target, make, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     assert exit_code("cp", "quickstart", str(tmp_path / target)) == 2
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("word", ["seed=nan", "motions.library=/nowhere"])
+def test_a_refused_baselines_leaves_the_file_it_would_replace(word, tmp_path, capsys):
+    out = tmp_path / "scores.json"
+    out.write_text("of another time")
+    words = ["baselines", "quickstart", word, "--out"]
+    assert main([*words, str(out)]) == 2
+    assert out.read_text() == "of another time"
+    assert main([*words, str(tmp_path)]) == 2
+    assert "a folder" in capsys.readouterr().err

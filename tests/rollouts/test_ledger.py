@@ -13,10 +13,11 @@ import torch
 
 from flashdex.errors import FlashdexError, RunError
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.ledger import CONVERSIONS, UNMOVED, Ledger, rollout_name
+from flashdex.rollouts.ledger import CONVERSIONS, UNMOVED, Ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.verify import verify_run
 from flashdex.system.jsonl import append_line, read_lines, write_lines
+from flashdex.system.run_files import rollout_name
 
 REQUIRED = {
     "motion": str,

@@ -22,9 +22,8 @@ from flashdex.reports.run.facts import (
     num_motions,
 )
 from flashdex.reports.text import NOTHING, number
-from flashdex.rollouts.ledger import rollout_name
 from flashdex.system.files import own_file
-from flashdex.system.run_files import REPORT
+from flashdex.system.run_files import REPORT, rollout_name
 
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
 BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}

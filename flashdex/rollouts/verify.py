@@ -15,9 +15,9 @@ from typing import Any
 
 from flashdex.errors import FlashdexError, RunError
 from flashdex.metrics.criteria import criterion_names, moves_too_little
-from flashdex.rollouts.certificate import CERTIFICATE_SCHEMA, PROVEN, certify
-from flashdex.rollouts.checks import OLD, RolloutCheck
-from flashdex.rollouts.findings import Finding, differences, short
+from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
+from flashdex.rollouts.checks import RolloutCheck
+from flashdex.rollouts.findings import OLD, Finding, at, differences
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
@@ -34,8 +34,6 @@ from flashdex.system.names import file_stem
 
 CERTIFICATE = ".certificate.json"
 MAX_JSON = 16 << 20  # bytes of a certificate
-# of a certificate: where it was made, and what follows from a clock
-_ELSEWHERE = ("identity.certified_by", "provenance.certified_on")
 # of a line: what is counted from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
 RATIOS = ("lift_ratio", "path_ratio")
@@ -193,7 +191,7 @@ class _RunCheck:
         found: dict[tuple[str, str], list[str]] = {}
         for name, motions in rows.items():
             for motion in motions if isinstance(motions, dict) else ():
-                for criterion in _at(motions, motion, "passed") or ():
+                for criterion in at(motions, motion, "passed") or ():
                     found.setdefault((motion, criterion), []).append(name)
         return found
 
@@ -299,7 +297,7 @@ class _RunCheck:
         except (FlashdexError, ValueError) as error:
             return "not_measured", stored, [*found, Finding(name, "model", str(error))]
         if stored:
-            found += _compare_certificates(stored, new, name)
+            found += compare_certificates(stored, new, name)
         return new["verdict"], stored, found
 
     def _told(
@@ -344,47 +342,6 @@ class _RunCheck:
             for key, said, right in pairs
             for text in differences(said, right, at=key, tolerance=2e-6)
         ]
-
-
-def _compare_certificates(
-    stored: dict[str, Any], new: dict[str, Any], file: str
-) -> list[Finding]:
-    """Every number of a stored certificate that is not that of a new one."""
-    schema = _at(stored, "identity", "schema")
-    found: list[Finding] = []
-    if schema != CERTIFICATE_SCHEMA:
-        found.append(Finding(file, "hashes", OLD, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        new["nominal"] = {k: new["nominal"].get(k) for k in stored["nominal"]}
-    here = [_at(new, *name.split(".")) for name in _ELSEWHERE]
-    there = [_at(stored, *name.split(".")) for name in _ELSEWHERE]
-    if schema == CERTIFICATE_SCHEMA and here != there:
-        text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
-        found.append(Finding(file, "numbers", text, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        del stored["nominal"], new["nominal"]
-    return found + [
-        Finding(file, text.split(" ")[0], text) for text in differences(stored, new)
-    ]
-
-
-def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:
-    """Verdict, and state and values of each criterion."""
-    nominal = certificate.get("nominal")
-    nominal = nominal if isinstance(nominal, dict) else {}
-    return {
-        "verdict": certificate.get("verdict"),
-        "nominal": {
-            name: {key: _at(verdict, key) for key in ("state", "values")}
-            for name, verdict in nominal.items()
-        },
-    }
-
-
-def _at(value: Any, *names: str) -> Any:
-    for name in names:
-        value = value.get(name) if isinstance(value, dict) else None
-    return value
 
 
 def _read_json(file: Path) -> tuple[dict[str, Any], str]:

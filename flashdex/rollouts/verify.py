@@ -33,6 +33,7 @@ from flashdex.system.jsonl import read_lines
 from flashdex.system.names import file_stem
 
 CERTIFICATE = ".certificate.json"
+SEAL = b"# sha256 of the lines above: "
 MAX_JSON = 16 << 20  # bytes of a certificate
 # of a line: what is counted from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
@@ -243,8 +244,11 @@ class _RunCheck:
             found.append(Finding(file, "hashes", OLD, is_fault=False))
         recipe = own_file(self.run_dir, "recipe.yaml")
         if "recipe_sha256" in said and recipe.is_file():
-            sha = hashlib.sha256(recipe.read_bytes()).hexdigest()
-            if said["recipe_sha256"] != sha:
+            content = recipe.read_bytes()
+            # the file may end with a seal, which is no part of the recipe
+            bodies = content, content[: content.rfind(SEAL)]
+            shas = [hashlib.sha256(body).hexdigest() for body in bodies]
+            if said["recipe_sha256"] not in shas:
                 changed = self._was_overridden()
                 text = "recipe.yaml is another than it was made by"
                 text += ", as --resume changed it" if changed else ""

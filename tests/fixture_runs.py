@@ -63,7 +63,7 @@ def roll_tiny(library, hands, bank):
     bench = RunBuilder(recipe, library, hands, bank)
 
     def roll(controller):
-        return roll_all(bench, controller)
+        return list(roll_all(bench, controller))
 
     return roll
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import csv
 import importlib.util
-import json
 import re
 from pathlib import Path
 
 import pytest
 
 from flashdex.cli.main import make_parser
+from flashdex.system.jsonl import read_lines
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -98,12 +98,8 @@ def tiny_run(run_tiny):
     return run_tiny("per_hand")
 
 
-def read_rows(file):
-    return [json.loads(line) for line in file.read_text().splitlines()]
-
-
 def logged_keys(run_dir):
-    return {key for row in read_rows(run_dir / "metrics.jsonl") for key in row}
+    return {key for row in read_lines(run_dir / "metrics.jsonl") for key in row}
 
 
 def general(key):
@@ -132,7 +128,7 @@ def test_glossary_names_exactly_the_logged_keys(tiny_run, run_tiny):
 
 
 def test_run_page_names_exactly_the_keys_of_an_attempt(tiny_run):
-    lines = read_rows(tiny_run / "conversions.jsonl")
+    lines = read_lines(tiny_run / "conversions.jsonl")
     assert lines
     keys = {key for line in lines for key in line}
     # of conversions only
@@ -172,7 +168,7 @@ def test_criteria_page_names_exactly_the_criteria():
 
 
 def test_data_page_names_exactly_the_frame_entries():
-    from flashdex.motions.library import FRAME_KEYS
+    from flashdex.motions.library_format import FRAME_KEYS
 
     assert set(FRAME_KEYS) == first_cells("data.md", "frames")
 
@@ -189,7 +185,7 @@ def test_data_page_names_exactly_the_codes_of_a_report():
 
 
 def test_data_page_names_exactly_the_quality_entries():
-    from flashdex.motions.library import QUALITY_KEYS
+    from flashdex.motions.library_format import QUALITY_KEYS
 
     assert set(QUALITY_KEYS) == first_cells("data.md", "quality")
 

@@ -213,7 +213,7 @@ def _train(args: argparse.Namespace) -> int:
         print("---\n".join(dump_recipe(recipe) for recipe in recipes), end="")
         return 0
     for recipe in recipes:
-        if not _show_run(train(recipe)):
+        if not _show_run(train(recipe, args.overrides)):
             break
     return 0
 

@@ -23,6 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
+MAX_PARTS = 50_000_000  # of the containers of a file
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
 # what an old torch file begins with, its version, and the storages it may hold
@@ -295,6 +296,9 @@ def unpickle(file: IO[bytes]) -> Any:
     """
     tree = _load(file)
     done: dict[int, Any] = {}
+    # parts of each container, shared ones as often as they are met: lists of the same
+    # lists make billions of a few bytes for whoever goes over them
+    parts: dict[int, int] = {}
     size = 0
 
     def plain(item: Any) -> Any:
@@ -310,6 +314,11 @@ def unpickle(file: IO[bytes]) -> Any:
             size += getattr(made, "nbytes", 0) or 8 * length
             if size > MAX_BYTES:
                 raise ValueError("it becomes more than 2 GiB")
+            if length:
+                inner = made.values() if isinstance(made, dict) else made
+                parts[id(made)] = length + sum(parts.get(id(i), 0) for i in inner)
+                if parts[id(made)] > MAX_PARTS:
+                    raise ValueError(f"it has more than {MAX_PARTS} parts")
         if done[key] is BUSY:
             raise ValueError("a part that contains itself")
         return done[key]

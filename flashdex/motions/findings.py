@@ -49,7 +49,9 @@ def of_error(error: Exception) -> Finding:
         usual = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
         return reject(error.code or usual, error.text)
     if is_of_machine(error):
-        text = f"{error or type(error).__name__}; not the recording's fault, so the "
+        text = (
+            f"{str(error) or 'not enough memory'}; not the recording's fault, so the "
+        )
         return reject("E_MACHINE", f"{text}same command tries it again")
     if isinstance(error, OSError):  # a name too long, a folder that may not be entered
         return reject("E_FILE", f"cannot be read: {error}")

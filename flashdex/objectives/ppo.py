@@ -14,6 +14,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from flashdex.modules.gaussian_policy import GaussianPolicy, ValueNet
+from flashdex.objectives.stepper import check_moments
 
 # A wide observation leaves room for small steps only: rates near 1e-5 are usual.
 LR_FACTOR, LR_RANGE = 1.5, (1e-6, 1e-2)
@@ -237,6 +238,7 @@ class PPO:
         self.policy.load_state_dict(state["policy"])
         self.value.load_state_dict(state["value"])
         self.optimizer.load_state_dict(state["optimizer"])
+        check_moments(self.optimizer)
         # Adam leaves the rate on the device it was stored from.
         group = self.optimizer.param_groups[0]
         group["lr"] = group["lr"].to(self.policy.log_std.device)

@@ -77,7 +77,23 @@ class ScheduledAdam:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict`."""
         self.adam.load_state_dict(state["adam"])
+        check_moments(self.adam)
         self.steps = state["steps"]
+
+
+def check_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Refuse moments of other shapes than their parameters, which torch takes as is.
+
+    Raises:
+        ValueError: one differs.
+    """
+    for parameter, moments in optimizer.state.items():
+        for key in ("exp_avg", "exp_avg_sq"):
+            if moments[key].shape != parameter.shape:
+                raise ValueError(
+                    f"{key} has shape {tuple(moments[key].shape)}, its parameter "
+                    f"{tuple(parameter.shape)}"
+                )
 
 
 class FlashSACStepper:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import struct
 from pathlib import Path
@@ -35,9 +36,9 @@ def read_scene(path: Path) -> trimesh.Scene:
             other exception, as each reader of trimesh fails in its own way.
     """
     with path.open("rb") as file:
-        data = file.read(MAX_FILE + 1)
-    if len(data) > MAX_FILE:
-        raise ValueError(f"more than {MAX_FILE >> 20} MiB")
+        if os.fstat(file.fileno()).st_size > MAX_FILE:
+            raise ValueError(f"more than {MAX_FILE >> 20} MiB")
+        data = file.read()
     kind = path.suffix.lower().removeprefix(".")
     if kind == "ply":
         _check_ply(data)
@@ -61,9 +62,9 @@ def _check_ply(data: bytes) -> None:
 
 
 def _check_glb(data: bytes) -> None:
-    if len(data) < 20:
-        raise ValueError("it ends before its head")
     (length,) = struct.unpack_from("<I", data, 12)
+    if 20 + length > len(data):
+        raise ValueError("it ends in its head")
     scene = json.loads(data[20 : 20 + length])
     if any("uri" in buffer for buffer in scene.get("buffers", [])):
         raise ValueError("its numbers are in another file")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
 from flashdex.errors import MeshError, is_of_machine
+from flashdex.objects.bodies import make_winding_consistent, orient_bodies
 from flashdex.objects.mesh_files import MESH_SUFFIXES, read_scene
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
@@ -35,6 +36,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         )
     try:
         mesh = read_scene(path).to_mesh()
+        if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+            raise ValueError("not triangles of points in space")
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
@@ -53,7 +56,8 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     """A mesh (m) with what can be repaired without changing its shape; a new one.
 
     Merges vertices, drops faces without area and loose components below 1 % of the
-    area, makes the winding consistent and outward, closes small holes; others stay.
+    area, makes the winding consistent, bodies outward and cavities inward, closes small
+    holes; others stay.
     The name, of a file or object, is for messages.
 
     Raises:
@@ -67,11 +71,12 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     _drop_loose_components(mesh)
     mesh.remove_unreferenced_vertices()
     _refuse_flat(mesh, name)
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-        trimesh.repair.fix_inversion(mesh, multibody=True)
+    make_winding_consistent(mesh)
     if not mesh.is_watertight:
         trimesh.repair.fill_holes(mesh)
+        mesh.update_faces(mesh.unique_faces())  # a triangle is not closed by its back
+    orient_bodies(mesh)
+    mesh.remove_unreferenced_vertices()
     if mesh.volume < 0:
         mesh.invert()
     return mesh

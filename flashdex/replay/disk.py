@@ -9,8 +9,8 @@ plus the rows of the intervals between the kept checkpoints.
 
 from __future__ import annotations
 
-import json
 import logging
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -19,14 +19,18 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
+from flashdex.errors import RunError
 from flashdex.replay.buffer import RowBuffer
 from flashdex.replay.codec import row_bytes
-from flashdex.system.files import open_atomic, write_atomic
+from flashdex.system.files import own_files, own_folder, remove_own
+from flashdex.system.jsonl import read_object, write_object
+from flashdex.system.run_files import CHECKPOINTS, FOLDERS, REPLAY
+from flashdex.system.tensors import first_non_finite, read_tensors, write_tensors
 
 _LOG = logging.getLogger(__name__)
-FOLDER, REPLAY = "checkpoints", "replay"  # of the run, and in it
 PART_BYTES = 1 << 28  # of one segment; bounds the memory a checkpoint takes
 _WRAP = 1 << 32  # torchrl counts written rows in 32 bits
+_SEGMENT = re.compile(r"\d{12}-\d{1,6}\.pt")
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,43 @@ class Segment:
         """Number after its last row."""
         return self.first + self.rows
 
+    @classmethod
+    def parse(cls, entry: Any) -> Segment:
+        """Read an entry of a manifest.
 
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))
+        Raises:
+            ValueError: it is none.
+        """
+        is_whole = isinstance(entry, dict) and set(entry) == {"file", "first", "rows"}
+        if not is_whole or not all(_is_count(entry[k]) for k in ("first", "rows")):
+            raise ValueError(f"{entry!r:.80} is no entry of a segment")
+        name = entry["file"]
+        if not isinstance(name, str) or not _SEGMENT.fullmatch(name):
+            raise ValueError(f"{name!r:.80} is no name of a segment")
+        return cls(**entry)
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 1 << 62
+
+
+def _read(run_dir: Path, stem: str) -> tuple[dict[str, Any], list[Segment]]:
+    """Manifest of a checkpoint and its segments, empty where it has none.
+
+    Raises:
+        RunError: it is damaged, or a link.
+        ValueError: it says what no manifest says.
+    """
+    manifest = read_object(run_dir, REPLAY, f"{stem}.json")
+    if not manifest:
+        return {}, []
+    for key in ("capacity", "written", "rows"):
+        if not _is_count(manifest.get(key)):
+            raise ValueError(f"its manifest has {manifest.get(key)!r:.40} as '{key}'")
+    segments = manifest.get("segments")
+    if not isinstance(segments, list):
+        raise ValueError("its manifest names no segments")
+    return manifest, [Segment.parse(entry) for entry in segments]
 
 
 class ReplayLog:
@@ -57,7 +95,7 @@ class ReplayLog:
     def __init__(
         self, run_dir: Path, buffer: ReplayBuffer, *, meaning: str, enabled: bool = True
     ) -> None:
-        self.folder = run_dir / FOLDER / REPLAY
+        self.run_dir, self.folder = run_dir, run_dir / REPLAY
         self.buffer, self.meaning, self.enabled = buffer, meaning, enabled
         self._segments: list[Segment] = []
         self._written = 0  # rows ever stored, earlier sessions included
@@ -72,7 +110,8 @@ class ReplayLog:
         """Write what is new, then the manifest ``<stem>.json``."""
         if not self.enabled:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
+        own_folder(self.run_dir, CHECKPOINTS)
+        own_folder(self.run_dir, REPLAY)
         if isinstance(self.buffer, RowBuffer):
             self.buffer.flush()  # rows on their way count as stored
         self._count()
@@ -87,7 +126,7 @@ class ReplayLog:
             "rows": len(self.buffer),
             "segments": [asdict(s) for s in segments],
         }
-        write_atomic(self.folder / f"{stem}.json", json.dumps(manifest))
+        write_object(manifest, self.run_dir, REPLAY, f"{stem}.json")
         self._segments = segments
 
     def _count(self) -> None:
@@ -108,8 +147,8 @@ class ReplayLog:
             number = torch.arange(first, end, device=storage.device)
             rows = storage[(cursor - self._written + number) % self.capacity].cpu()
             segment = Segment(f"{stem}-{len(out)}.pt", first, end - first)
-            with open_atomic(self.folder / segment.file) as file:
-                torch.save(rows.to_dict(), file)
+            content = {"sealed": True, "rows": rows.to_dict()}
+            write_tensors(content, self.run_dir, REPLAY, segment.file)
             out.append(segment)
         return out
 
@@ -119,15 +158,16 @@ class ReplayLog:
         Equal capacity puts every row where it was, so that sampling goes on bit-equal;
         a smaller or larger ring takes the newest rows.
         """
-        path = self.folder / f"{stem}.json"
-        if not path.is_file():
-            return False
         try:
-            manifest = _read(path)
-            if manifest["meaning"] != self.meaning:
+            manifest, segments = _read(self.run_dir, stem)
+            if not manifest:
+                if self.enabled:
+                    _LOG.warning("checkpoint %s has no replay rows", stem)
+                return False
+            if manifest.get("meaning") != self.meaning:
                 _LOG.warning("an override changed what replay rows mean: none is kept")
                 return False
-            self._fill(manifest)
+            self._fill(manifest, segments)
         except Exception as error:
             _LOG.warning(
                 "replay rows of checkpoint %s cannot be read (%s): the policy fills "
@@ -141,8 +181,7 @@ class ReplayLog:
             return False
         return True
 
-    def _fill(self, manifest: dict[str, Any]) -> None:
-        segments = [Segment(**s) for s in manifest["segments"]]
+    def _fill(self, manifest: dict[str, Any], segments: list[Segment]) -> None:
         written = manifest["written"]
         same = manifest["capacity"] == self.capacity
         oldest = written - min(manifest["rows"], self.capacity)
@@ -151,8 +190,7 @@ class ReplayLog:
         writer, storage = self.buffer.writer, cast(Any, self.buffer.storage)
         writer.load_state_dict({"_cursor": first % self.capacity if same else 0})
         for segment in segments:
-            content = torch.load(self.folder / segment.file, weights_only=True)
-            rows = TensorDict(content, batch_size=[segment.rows])
+            rows = self._rows(segment)
             rows = rows[max(0, oldest - segment.first) :]
             if len(rows):
                 self.buffer.extend(rows.to(storage.device))
@@ -164,16 +202,38 @@ class ReplayLog:
         self._segments = segments if same else []
         self._written = written if same else len(self.buffer)
 
+    def _rows(self, segment: Segment) -> TensorDict:
+        """Rows of a file.
+
+        Raises:
+            RunError, ValueError: it is a link, damaged, or holds what is not finite.
+        """
+        try:
+            content = read_tensors(self.run_dir, REPLAY, segment.file)
+        except ValueError as error:
+            raise ValueError(f"{segment.file}: {error}") from error
+        if isinstance(content, dict) and content.get("sealed") is True:
+            content = content.get("rows")  # bare in earlier versions
+        if not isinstance(content, dict):
+            raise ValueError(f"{segment.file}: it holds no rows")
+        if bad := first_non_finite(content):
+            raise ValueError(f"{segment.file}: its '{bad}' is not finite")
+        return TensorDict(content, batch_size=[segment.rows])
+
     def prune(self, stems: set[str]) -> None:
-        """Delete what no remaining checkpoint needs."""
+        """Delete what no remaining checkpoint needs; files of its own only.
+
+        While a manifest cannot be read nobody knows what it needs: nothing goes.
+        """
         needed = {f"{stem}.json" for stem in stems}
         for stem in stems:
-            path = self.folder / f"{stem}.json"
-            if path.is_file():
-                manifest = _read(path)
-                needed |= {s["file"] for s in manifest["segments"]}
-        for path in self.folder.glob("*"):
-            if path.name not in needed:
-                path.unlink()
+            try:
+                needed |= {s.file for s in _read(self.run_dir, stem)[1]}
+            except (RunError, ValueError) as error:
+                _LOG.warning("%s: no replay rows are deleted: %s", self.folder, error)
+                return
+        for path in own_files(self.run_dir, REPLAY, "[0-9]*"):
+            if path.name not in needed and FOLDERS[REPLAY].fullmatch(path.name):
+                remove_own(self.run_dir, REPLAY, path.name)
         # after a failed save its segments are gone, and have to be written again
         self._segments = [s for s in self._segments if s.file in needed]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -37,15 +36,6 @@ def leading_time(hands: dict[keys.Side, HandSpec], recipe: Recipe) -> Tensor | N
     lead = torch.tensor(np.stack(lags), dtype=torch.float32)
     lead[:, NUM_WRIST_JOINTS:] = 0.0
     return lead
-
-
-def library_hashes(library: MotionLibrary) -> list[str]:
-    """Hash of the content, as a run stores it first, then as older versions did."""
-    manifest = library.path / "manifest.json"
-    found = [getattr(library, "content_hash", None)]
-    if manifest.is_file():
-        found.append(hashlib.sha256(manifest.read_bytes()).hexdigest())
-    return [sha for sha in found if sha]
 
 
 class _Scenes(Mapping[int, Scene]):
@@ -160,7 +150,7 @@ class Truth:
             seed=recipe.seed,
             made_by=json.loads(stored.versions),
             provenance=json.loads(stored.provenance),
-            motion_hash=getattr(self.library, "motion_hash", None),
+            motion_hash=self.library.motion_hash,
         )
 
     def _start(self, row: int) -> dict[str, Tensor]:

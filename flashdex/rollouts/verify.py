@@ -26,14 +26,13 @@ from flashdex.rollouts.ledger import (
     rollout_name,
 )
 from flashdex.rollouts.rollout import Rollout
-from flashdex.rollouts.truth import Truth, library_hashes
+from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_files
-from flashdex.system.jsonl import read_lines
 from flashdex.system.names import file_stem
+from flashdex.system.run_files import RECIPE, read_metrics, read_recipe, read_sessions
 
 CERTIFICATE = ".certificate.json"
-SEAL = b"# sha256 of the lines above: "
 MAX_JSON = 16 << 20  # bytes of a certificate
 # of a line: what is counted from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
@@ -173,7 +172,7 @@ class _RunCheck:
     def _attempts(self) -> int:
         """Attempts that the last record of the metrics counts."""
         try:
-            records = read_lines(own_file(self.run_dir, "metrics.jsonl"))
+            records = read_metrics(self.run_dir)
             return int(records[-1].get("convert/attempts", 0)) if records else 0
         except (RunError, TypeError, ValueError) as error:
             self.fault("metrics", str(error), file="metrics.jsonl")
@@ -242,34 +241,40 @@ class _RunCheck:
         said, found = json.loads(rollout.provenance), []
         if "reference_sha256" not in said:
             found.append(Finding(file, "hashes", OLD, is_fault=False))
-        recipe = own_file(self.run_dir, "recipe.yaml")
-        if "recipe_sha256" in said and recipe.is_file():
-            content = recipe.read_bytes()
-            # the file may end with a seal, which is no part of the recipe
-            bodies = content, content[: content.rfind(SEAL)]
-            shas = [hashlib.sha256(body).hexdigest() for body in bodies]
-            if said["recipe_sha256"] not in shas:
+        if "recipe_sha256" in said and (self.run_dir / RECIPE).exists():
+            sha = self._recipe_sha256()
+            if said["recipe_sha256"] != sha:
                 changed = self._was_overridden()
                 text = "recipe.yaml is another than it was made by"
                 text += ", as --resume changed it" if changed else ""
                 found.append(Finding(file, "recipe", text, is_fault=not changed))
         if self.truth is None:
             return found
-        library, shas = self.truth.library, library_hashes(self.truth.library)
-        if "library_sha256" in said and said["library_sha256"] not in shas:
+        library = self.truth.library
+        # older versions named a file's hash, of libraries that are not read any more
+        is_bound = "reference_sha256" in said
+        if is_bound and said.get("library_sha256") != library.content_hash:
             text = f"{library.path} is another than it was made from"
             found.append(Finding(file, "library", text))
-        hash_of = getattr(library, "motion_hash", None)
         names = self.truth.bank.names
-        if hash_of and "motion_sha256" in said and rollout.motion in names:
-            sha = hash_of(names.index(rollout.motion))
+        if "motion_sha256" in said and rollout.motion in names:
+            sha = library.motion_hash(names.index(rollout.motion))
             if said["motion_sha256"] != sha:
                 text = "the library has another motion of that name"
                 found.append(Finding(file, "motion", text))
         return found
 
+    def _recipe_sha256(self) -> str:
+        try:
+            recipe = read_recipe(self.run_dir)
+        except RunError:
+            return ""  # of no recipe
+        return hashlib.sha256(recipe.encode()).hexdigest()
+
     def _was_overridden(self) -> bool:
-        return any(session.get("overrides") for session in self._sessions())
+        """A later session than the first was given other values."""
+        starts = [x for x in self._sessions() if x.get("event") == "start"]
+        return any(session.get("overrides") for session in starts[1:])
 
     def _is_over(self) -> bool:
         """The last session ended in order, and so counted all its attempts."""
@@ -279,7 +284,7 @@ class _RunCheck:
 
     def _sessions(self) -> list[dict[str, Any]]:
         try:
-            return read_lines(own_file(self.run_dir, "sessions.jsonl"))
+            return read_sessions(self.run_dir)
         except RunError:
             return []
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.errors import RunError
-from flashdex.system.files import open_atomic, open_plain
+from flashdex.system.files import open_atomic, open_own, open_plain, read_own
 
 _LOG = logging.getLogger(__name__)
 SEAL = re.compile(rb', "sha256": "([0-9a-f]{64})"}\Z')
@@ -46,6 +47,8 @@ def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]
     """
     content = _read(path)
     whole = content[: _whole(content)]
+    if len(whole) < len(content):
+        _LOG.warning("%s: its last line is not whole and is left out", path)
     out, before, sealed, position = [], "", False, 0
     for number, raw in enumerate(whole.split(b"\n")[:-1], start=1):
         length = len(raw) + 1
@@ -61,8 +64,10 @@ def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]
             if before != expected:
                 raise _fault(path, number, "was changed, or one before it is missing")
             raw = body
-        out.append(_parse(path, number, raw, schema))
+        out.append(_parse(path, number, raw))
         position += length
+    for number, line in enumerate(out, start=1):
+        check_keys(line, schema or {}, path, number)
     return out
 
 
@@ -85,26 +90,34 @@ def _whole(content: bytes) -> int:
     return content.rstrip(b"\0").rfind(b"\n") + 1
 
 
-def _parse(
-    path: Path, number: int, raw: bytes, schema: Schema | None
-) -> dict[str, Any]:
+def _parse(path: Path, number: int, raw: bytes) -> dict[str, Any]:
     try:
         line = json.loads(raw.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise _fault(path, number, f"is not JSON ({error})") from error
     if not isinstance(line, dict):
         raise _fault(path, number, "is not a JSON object")
-    for key, kind in (schema or {}).items():
+    return line
+
+
+def check_keys(
+    line: Mapping[str, Any], schema: Schema, path: Path, number: int
+) -> None:
+    """Check the types of what a line has to hold; numbers are finite, true is none.
+
+    Raises:
+        RunError: it lacks something, or has something else there.
+    """
+    for key, kind in schema.items():
         if key not in line:
             raise _fault(path, number, f"lacks '{key}'")
         kinds = kind if isinstance(kind, tuple) else (kind,)
         kinds = (*kinds, int) if float in kinds else kinds
         value = line[key]
-        if not isinstance(value, kinds) or (
-            isinstance(value, bool) and bool not in kinds
-        ):
+        is_flag = isinstance(value, bool) and bool not in kinds
+        endless = isinstance(value, float) and not math.isfinite(value)
+        if not isinstance(value, kinds) or is_flag or endless:
             raise _fault(path, number, f"has {value!r:.60} as '{key}'")
-    return line
 
 
 def _fault(path: Path, number: int, what: str) -> RunError:
@@ -174,3 +187,37 @@ def write_lines(path: Path, lines: Iterable[dict[str, Any]]) -> None:
             text = seal(json.dumps(line), before)
             before = text[-66:-2]
             file.write(text.encode("utf-8") + b"\n")
+
+
+def write_object(content: dict[str, Any], root: Path, *parts: str) -> None:
+    """Write a JSON object, sealed, as a file of a run; see ``open_own``."""
+    # a seal that is damaged beyond recognition is missed where this stands
+    text = seal(json.dumps({"sealed": True, **content}, indent=1), "")
+    with open_own(root, *parts) as file:
+        file.write(text.encode("utf-8") + b"\n")
+
+
+def read_object(root: Path, *parts: str) -> dict[str, Any]:
+    """A JSON object of a run, its seal left out; one that is not there is empty.
+
+    Raises:
+        RunError: it is damaged, was changed, or is something else.
+    """
+    text = read_own(root, *parts)
+    if text is None:
+        return {}
+    path, text = root.joinpath(*parts), text.removesuffix("\n")
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{path}: not JSON ({error}). Restore or remove it.") from error
+    if not isinstance(found, dict):
+        raise RunError(f"{path}: not a JSON object. Restore or remove it.")
+    is_sealed = found.pop("sealed", None) is not None
+    is_sealed |= found.pop("sha256", None) is not None
+    if is_sealed and seal(text[:-SEAL_BYTES] + "}", "") != text:
+        raise RunError(
+            f"{path}: was changed or damaged since flashdex wrote it. Restore or "
+            "remove it."
+        )
+    return found

@@ -164,6 +164,38 @@ def describe_commit() -> str:
     return commit + ("+" if _output("git", "status", "--porcelain", "-uno") else "")
 
 
+DIFF_BYTES = 8 << 20  # of changes that are worth keeping
+
+
+def source_changes() -> bytes:
+    """Uncommitted changes of flashdex's own checkout, empty where that fails.
+
+    Commands that a git configuration names for diffs do not run, nor is the index
+    written. Long ones are cut off, and say so.
+    """
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return b""
+    words = ["git", "--no-optional-locks", "-c", "core.fsmonitor=false", "-C"]
+    words += [str(root), "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD"]
+    # variables that name another repository or a command of their own
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
+    try:
+        done = subprocess.run(
+            words,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return b""
+    if len(done.stdout) > DIFF_BYTES:
+        return done.stdout[:DIFF_BYTES] + b"\n(cut off)\n"
+    return done.stdout
+
+
 def _output(*words: str) -> str | None:
     """What a program prints, run beside this file; None where it fails."""
     options: Any = {"capture_output": True, "text": True, "timeout": 20}

@@ -22,7 +22,7 @@ from flashdex.system.limited import LimitError, run_limited
 MAX_BYTES = 32 << 20  # of text; scenes of ours have less than a megabyte
 MAX_ELEMENTS, MAX_DEPTH = 20_000, 64
 MAX_NUMBER = 1e12
-MAX_MEMORY, MAX_SECONDS = 4 << 30, 20  # of the trial, bytes and s
+MAX_MEMORY, MAX_SECONDS = 3 << 29, 20  # of the trial, bytes and s
 TRIAL_STEPS = 5
 
 # What reads files (include, model, attach, skin, hfield), multiplies (replicate,
@@ -70,7 +70,7 @@ RANGES: dict[tuple[str, str], tuple[float, float]] = {
 }
 MEMORY = re.compile(r"-1|(\d{1,15})([KMGTPE]?)")
 POWERS = {unit: 1 << (10 * i) for i, unit in enumerate(("", *"KMGTPE"))}
-MAX_SIZE_MEMORY = 1 << 30  # bytes, of ``<size memory>``
+MAX_SIZE_MEMORY = 256 << 20  # bytes, of ``<size memory>``
 _passed: set[str] = set()  # models that passed their trial, by hash
 
 
@@ -212,7 +212,7 @@ class _Reader:
         if match is None or (
             match[1] and int(match[1]) * POWERS[match[2]] > MAX_SIZE_MEMORY
         ):
-            self._refuse(f"{shown}: at most 1G")
+            self._refuse(f"{shown}: at most 256M")
 
 
 def _number(word: str) -> float | None:

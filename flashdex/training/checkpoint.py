@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,15 @@ from typing import Any
 import torch
 
 from flashdex.errors import RunError
-from flashdex.replay.disk import FOLDER, ReplayLog
-from flashdex.system.files import open_atomic
+from flashdex.replay.disk import ReplayLog
+from flashdex.system.files import own_file, own_files, own_folder, remove_own
+from flashdex.system.run_files import CHECKPOINTS as FOLDER
+from flashdex.system.run_files import FOLDERS
+from flashdex.system.tensors import first_non_finite, read_tensors, write_tensors
 
 _LOG = logging.getLogger(__name__)
-FORMAT = 2  # raised whenever older code could misread a checkpoint
+FORMAT = 3  # raised whenever older code could misread a checkpoint
+READ = (2, FORMAT)  # those before 3 have no seal
 EVALUATED = ("env_steps", "learner", "recipe")
 RESUMED = (
     *EVALUATED,
@@ -27,6 +32,23 @@ RESUMED = (
     "ledger_bytes",
     "wandb_id",
 )
+TYPES: dict[str, tuple[type, ...]] = {
+    "env_steps": (int,),
+    "vector_steps": (int,),
+    "env_steps_lost": (int,),
+    "records": (int,),
+    "ledger_bytes": (int,),
+    "wall_s": (float, int),
+    "learner": (dict,),
+    "update": (dict, type(None)),  # of a dump
+    "recipe": (str,),
+    "run": (str,),
+    "wandb_id": (str, type(None)),
+    "assist": (dict, type(None)),
+    "assist_epoch": (dict,),
+    "env_generator": (torch.Tensor,),
+    "torch_rng": (torch.Tensor,),
+}
 
 
 def save_checkpoint(
@@ -44,19 +66,15 @@ def save_checkpoint(
     Raises:
         OSError: the disk is full, say; the former checkpoints are as they were.
     """
-    path = run_dir / FOLDER / f"{checkpoint_name(state['env_steps'])}.pt"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = own_folder(run_dir, FOLDER) / f"{checkpoint_name(state['env_steps'])}.pt"
     try:
         if replay is not None:
             replay.save(path.stem)
-        with open_atomic(path) as file:
-            torch.save({"format": FORMAT, **state}, file)
-    except RuntimeError as error:
-        # torch's writer reports a failed write as a RuntimeError of its own
-        raise OSError(f"{path}: {error}") from error
+        content = {"format": FORMAT, "sealed": True, **state}
+        write_tensors(content, run_dir, FOLDER, path.name)
     finally:
         for old in _newest_first(run_dir)[keep:]:
-            old.unlink()
+            remove_own(run_dir, FOLDER, old.name)
         if replay is not None:
             replay.prune(checkpoint_names(run_dir))
     return path
@@ -80,11 +98,10 @@ def load_checkpoint(
     faults = []
     for path in found:
         try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:
-            what = (str(error).strip() or type(error).__name__).splitlines()[0]
-            faults.append(f"{path.name}: {what}")
-            _LOG.warning("%s cannot be read, trying the one before", path)
+            state = _read(run_dir, path.name)
+        except ValueError as error:
+            faults.append(f"{path.name}: {error}")
+            _LOG.warning("%s cannot be used (%s), trying the one before", path, error)
             continue
         check_format(state, path, needs)
         return state
@@ -94,6 +111,19 @@ def load_checkpoint(
     )
 
 
+def _read(run_dir: Path, name: str) -> Any:
+    """What a checkpoint holds; the learner in it is finite.
+
+    Raises:
+        ValueError: it is damaged, or not finite.
+    """
+    state = read_tensors(run_dir, FOLDER, name)
+    learner = state.get("learner") if isinstance(state, dict) else None
+    if bad := first_non_finite(learner):
+        raise ValueError(f"its '{bad}' is not finite")
+    return state
+
+
 def check_format(state: Any, path: Path, needs: Collection[str] = ()) -> None:
     """Refuse a checkpoint of another version, or one without what is needed.
 
@@ -101,7 +131,7 @@ def check_format(state: Any, path: Path, needs: Collection[str] = ()) -> None:
         RunError: the format is another one, or a key is missing.
     """
     found = state.get("format", 0) if isinstance(state, dict) else None
-    if found != FORMAT:
+    if found not in READ:
         raise RunError(
             f"{path}: checkpoint format {found}, this version reads {FORMAT}. Go on "
             "with the flashdex that wrote it (versions.json in the run), or start anew."
@@ -111,6 +141,14 @@ def check_format(state: Any, path: Path, needs: Collection[str] = ()) -> None:
             f"{path}: not a whole checkpoint, it lacks {', '.join(missing)}. Move it "
             "away to go on from the one before, or start a new run."
         )
+    for key, kinds in TYPES.items():
+        value = state.get(key)
+        is_odd = isinstance(value, bool) or not isinstance(value, kinds)
+        if key in state and (is_odd or (isinstance(value, int) and value < 0)):
+            raise RunError(
+                f"{path}: not a checkpoint of flashdex, '{key}' is {value!r:.40}. Move "
+                "it away to go on from the one before, or start a new run."
+            )
 
 
 def checkpoint_name(env_steps: int) -> str:
@@ -142,15 +180,10 @@ def set_aside_newer(run_dir: Path, env_steps: int) -> None:
     """
     for path in _newest_first(run_dir):
         if int(path.stem) > env_steps:
-            path.replace(path.with_suffix(".unreadable"))
-
-
-def remove_temporaries(run_dir: Path) -> None:
-    """Delete the half-written files that a killed run left behind."""
-    for path in run_dir.rglob(".*.tmp"):
-        path.unlink(missing_ok=True)
+            os.replace(path, own_file(run_dir, FOLDER, f"{path.stem}.unreadable"))
 
 
 def _newest_first(run_dir: Path) -> list[Path]:
-    found = (run_dir / FOLDER).glob("*.pt")
-    return sorted((p for p in found if p.stem.isdigit()), reverse=True)
+    found = own_files(run_dir, FOLDER, "[0-9]*.pt")
+    names = [p for p in found if FOLDERS[FOLDER].fullmatch(p.name)]
+    return sorted(names, reverse=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
@@ -17,36 +16,13 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from flashdex.algorithms.base import Learner, snapshot
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
-from flashdex.system.files import open_atomic
+from flashdex.system.run_files import DUMP
+from flashdex.system.tensors import first_non_finite, read_tensors, write_tensors
 from flashdex.training.checkpoint import FORMAT, check_format, newest_checkpoint
-
-DUMP = "nan_dump.pt"  # everything to repeat the update that was not finite
-
-# Raw simulator states, which may hold anything once a world diverges.
-RAW = frozenset({"nstep"})
 
 
 class NonFiniteError(Exception):
     """A gradient, loss or weight is NaN or infinite."""
-
-
-def first_non_finite(state: Any, path: str = "") -> str:
-    """Path of the first tensor or number that is not finite, empty when all are.
-
-    Keys of raw simulator states are skipped.
-    """
-    if isinstance(state, Mapping | TensorDictBase):
-        items = [(k, v) for k, v in state.items() if k not in RAW]
-    elif isinstance(state, list | tuple):
-        items = list(enumerate(state))
-    elif isinstance(state, Tensor):
-        bad = state.is_floating_point() and not bool(state.isfinite().all())
-        return path if bad else ""
-    else:
-        bad = isinstance(state, float) and not -float("inf") < state < float("inf")
-        return path if bad else ""
-    found = (first_non_finite(v, f"{path}.{k}".lstrip(".")) for k, v in items)
-    return next((f for f in found if f), "")
 
 
 @contextmanager
@@ -134,6 +110,7 @@ def stop_with_dump(
     cause = _cause(what, state, update)
     dump = {
         "format": FORMAT,
+        "sealed": True,
         "what": cause,
         "env_steps": env_steps,
         "updates": learner.updates,
@@ -145,9 +122,8 @@ def stop_with_dump(
     }
     where = f"The state and the batch are in {run_dir / DUMP}."
     try:
-        with open_atomic(run_dir / DUMP) as file:
-            torch.save(dump, file)
-    except (OSError, RuntimeError) as error:
+        write_tensors(dump, run_dir, DUMP)
+    except (OSError, RunError) as error:
         where = f"The dump could not be written ({error})."
     return RunError(
         f"{run_dir}: not finite after {env_steps} env steps and {learner.updates} "
@@ -169,10 +145,14 @@ def _cause(what: str, state: Any, update: Any) -> str:
 
 
 def read_dump(path: Path) -> dict[str, Any]:
-    """Read a dump as plain data."""
+    """Read a dump as plain data.
+
+    Raises:
+        RunError: it is damaged, of another version, or no dump.
+    """
     try:
-        dump = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
+        dump = read_tensors(path.parent, path.name)
+    except ValueError as error:
         raise RunError(f"{path}: not a readable dump ({error}).") from error
-    check_format(dump, path)
+    check_format(dump, path, ("what", "recipe", "learner", "update", "torch_rng"))
     return dump

@@ -20,9 +20,8 @@ from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.files import own_file
-from flashdex.system.jsonl import read_lines
+from flashdex.system.run_files import read_metrics
 from flashdex.training.build import RunBuilder
-from flashdex.training.logging import METRICS
 from flashdex.training.memory.stand_in import find_library
 from flashdex.training.run_dir import load_learner, load_run_recipe
 
@@ -97,7 +96,7 @@ class Run:
     @cached_property
     def metrics(self) -> list[dict[str, Any]]:
         """Records of ``metrics.jsonl``."""
-        return read_lines(self.path / METRICS)
+        return read_metrics(self.path)
 
     @property
     def converted(self) -> dict[str, dict[str, Any]]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
-import subprocess
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Collection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,26 +14,41 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RunError
+from flashdex.errors import RecipeError, RunError
 from flashdex.recipe import GymRecipe, RunRecipe, dump_recipe, load_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
-from flashdex.system.files import run_lock, write_atomic
-from flashdex.system.machine import versions
+from flashdex.system.files import RunHold
+from flashdex.system.jsonl import write_object
+from flashdex.system.run_files import (
+    CHECKPOINTS,
+    EVALUATION,
+    RECIPE,
+    check_run,
+    check_sessions,
+    hold_run,
+    new_run,
+    read_recipe,
+    refuse_old_run,
+    remove_temporaries,
+    reported,
+    run_id,
+    write_recipe,
+)
 from flashdex.training.checkpoint import (
     checkpoint_name,
     checkpoint_names,
     has_checkpoint,
     load_checkpoint,
-    remove_temporaries,
     set_aside_newer,
 )
 from flashdex.training.guard import GradientGuard, numeric_errors, read_dump
 from flashdex.training.gym import GymTask
-from flashdex.training.logging import MetricLog
+from flashdex.training.logging import MetricLog, check_writers
 from flashdex.training.session import (
     begin_session,
     end_session,
+    interruptible,
     refuse_changes,
     stored_value,
 )
@@ -43,7 +57,6 @@ from flashdex.training.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)
-RECIPE, VERSIONS = "recipe.yaml", "versions.json"
 
 
 def default_run_dir(recipe: RunRecipe) -> Path:
@@ -58,17 +71,23 @@ def task_of(recipe: RunRecipe) -> type[Task]:
     return GymTask if isinstance(recipe, GymRecipe) else TrackingTask
 
 
-def train(recipe: RunRecipe) -> Path:
+def train(recipe: RunRecipe, overrides: Collection[str] = ()) -> Path:
     """Train a recipe from the beginning; return its run directory.
+
+    Args:
+        recipe: composed.
+        overrides: ``key=value`` words it was composed with, for the run's records.
 
     Raises:
         RunError: the folder already holds a run.
     """
     run_dir = default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
-    task = task_of(recipe).open(recipe, run_dir)
-    with new_run(run_dir, recipe):
-        return _train(task, run_dir, None, [])
+    check_writers(recipe)
+    with interruptible():
+        task = task_of(recipe).open(recipe, run_dir)
+    with new_run(run_dir, dump_recipe(recipe)) as hold:
+        return _train(task, hold, None, list(overrides), changed=False)
 
 
 def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
@@ -76,35 +95,52 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
 
     Raises:
         RunError: another process trains there, or the checkpoint does not fit the
-            overrides; the run is as it was then.
+            overrides or the run; the run is as it was then.
     """
     run_dir, overrides = Path(run), overrides or []
     recipe = load_run_recipe(run_dir, overrides)
-    with run_lock(run_dir):
-        remove_temporaries(run_dir)
+    check_writers(recipe)
+    with hold_run(run_dir) as hold:
+        check_run(run_dir)
+        check_sessions(run_dir)
+        with reported(run_dir):
+            remove_temporaries(run_dir)
         state = None
         if has_checkpoint(run_dir):
-            state = load_checkpoint(run_dir, task_of(recipe).resumed_keys)
+            state = _load_state(run_dir, task_of(recipe).resumed_keys)
             refuse_changes(_stored_recipe(run_dir, state), recipe)
-        task = task_of(recipe).open(recipe, run_dir)
+        with interruptible():
+            task = task_of(recipe).open(recipe, run_dir)
+        task.check_inputs(run_dir)
         # Nothing of the run is touched before all that could refuse it.
         if state is not None:
-            set_aside_newer(run_dir, state["env_steps"])
+            with reported(run_dir):
+                set_aside_newer(run_dir, state["env_steps"])
         else:
             _LOG.warning("%s: stopped before its first checkpoint, from 0", run_dir)
-        return _train(task, run_dir, state, overrides)
+        return _train(task, hold, state, overrides, changed=bool(overrides))
 
 
 def evaluate(run: str | Path, overrides: list[str] | None = None) -> dict[str, Any]:
     """Evaluate the newest policy of a run, as its kind of recipe does.
 
+    Where the run cannot be written a warning says so at once, and the scores are only
+    returned.
+
     Returns:
         What is written to ``evaluation.json`` in the run.
     """
-    task, learner, env_steps = load_learner(Path(run), overrides)
+    run_dir = Path(run)
+    load_run_recipe(run_dir, overrides)
+    if not os.access(run_dir, os.W_OK):
+        _LOG.warning("%s cannot be written: the scores are only shown", run_dir)
+    task, learner, env_steps = load_learner(run_dir, overrides)
     _set_up_process(task.recipe)
     result = task.evaluate(learner, env_steps)
-    write_atomic(Path(run) / "evaluation.json", json.dumps(result, indent=1))
+    try:
+        write_object(result, run_dir, EVALUATION)
+    except OSError as error:
+        _LOG.warning("%s is not written (%s)", run_dir / EVALUATION, error.strerror)
     return result
 
 
@@ -114,11 +150,15 @@ def load_learner(
     """The task of a run, its learner as it was stored last, and its env steps.
 
     Raises:
-        RunError: the folder holds no run, or none with a checkpoint that can be read.
+        RunError: the folder holds no run, none with a checkpoint that can be read, or
+            its motions are others now.
     """
     recipe = load_run_recipe(run_dir, overrides)
-    state = load_checkpoint(run_dir, task_of(recipe).evaluated_keys)
+    state = _load_state(run_dir, task_of(recipe).evaluated_keys)
     task = task_of(recipe).open(recipe)
+    # somebody who names other motions wants them
+    if not any(word.lstrip("+~").startswith("motions") for word in overrides or []):
+        task.check_inputs(run_dir)
     # The learner keeps a running return a world: as many as it was trained with.
     num_envs = stored_value(_stored_recipe(run_dir, state), task.worlds_key)
     learner = task.make_learner(task.make_env(num_envs=num_envs))
@@ -127,71 +167,36 @@ def load_learner(
 
 
 def load_run_recipe(run_dir: Path, overrides: list[str] | None = None) -> RunRecipe:
-    """Read the recipe a run was started with, as ``resume`` would go on with it."""
-    path = run_dir / RECIPE
-    if not path.is_file():
-        raise RunError(f"{run_dir}: not a run directory, there is no {RECIPE} in it.")
-    return load_recipe(path, overrides or [])
+    """Read the recipe a run was started with, as ``resume`` would go on with it.
+
+    Raises:
+        RunError: the folder holds no run, its recipe is damaged, or something else
+            stands where the run has a file.
+    """
+    read_recipe(run_dir)
+    check_run(run_dir)
+    check_sessions(run_dir, counts=False)
+    return load_recipe(run_dir / RECIPE, overrides or [])
+
+
+def _load_state(run_dir: Path, needs: Collection[str]) -> dict[str, Any]:
+    """The newest checkpoint of this very run.
+
+    Raises:
+        RunError: see ``load_checkpoint``; or it was made by another run.
+    """
+    state, own = load_checkpoint(run_dir, needs), run_id(run_dir)
+    if state.get("run", own) != own:
+        raise RunError(
+            f"{run_dir / CHECKPOINTS}: its newest checkpoint was made by another run "
+            "than this one. Move it away to go on from the one before."
+        )
+    return state
 
 
 def _stored_recipe(run_dir: Path, state: dict[str, Any]) -> str:
     """Recipe of a checkpoint; those of stock environments once had none."""
-    return state.get("recipe") or (run_dir / RECIPE).read_text(encoding="utf-8")
-
-
-@contextlib.contextmanager
-def new_run(run_dir: Path, recipe: RunRecipe) -> Iterator[None]:
-    """Make the folder of a new run and hold it; nobody else may start one in it.
-
-    Raises:
-        RunError: it holds a run, another process is at it, or it cannot be written.
-    """
-    with contextlib.ExitStack() as held:
-        with _reported(run_dir):
-            run_dir.mkdir(parents=True, exist_ok=True)
-            held.enter_context(run_lock(run_dir))
-        refuse_old_run(run_dir)  # another process may have just ended one
-        with _reported(run_dir):
-            write_atomic(run_dir / VERSIONS, json.dumps(versions(), indent=1))
-            if diff := _git("diff", "HEAD"):
-                write_atomic(run_dir / "git.diff", diff)
-            write_atomic(run_dir / RECIPE, dump_recipe(recipe))
-        yield
-
-
-def refuse_old_run(run_dir: Path) -> None:
-    """Raise a RunError when the folder already holds a run."""
-    if (run_dir / RECIPE).exists():
-        raise RunError(
-            f"{run_dir}: already holds a run. Continue it with 'flashdex train "
-            f"--resume {run_dir}', or choose another folder with run_dir=..."
-        )
-
-
-@contextlib.contextmanager
-def _reported(run_dir: Path) -> Iterator[None]:
-    """A folder that cannot be written is a mistake of the user."""
-    try:
-        yield
-    except OSError as error:
-        raise RunError(
-            f"{run_dir}: cannot be written ({error.strerror}). Choose another folder "
-            "with run_dir=..."
-        ) from error
-
-
-def _git(*args: str) -> str:
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():
-        return ""
-    words = ["git", "-C", str(root), *args]
-    try:
-        done = subprocess.run(
-            words, capture_output=True, text=True, timeout=10, check=False
-        )
-    except OSError:
-        return ""
-    return done.stdout if done.returncode == 0 else ""
+    return state.get("recipe") or read_recipe(run_dir)
 
 
 def _set_up_process(recipe: Any) -> None:
@@ -201,22 +206,40 @@ def _set_up_process(recipe: Any) -> None:
 
 
 def _train(
-    task: Task, run_dir: Path, state: dict[str, Any] | None, overrides: list[str]
+    task: Task,
+    hold: RunHold,
+    state: dict[str, Any] | None,
+    overrides: list[str],
+    *,
+    changed: bool,
 ) -> Path:
     """Train from a checkpoint, or from the beginning when there is none."""
     _set_up_process(task.recipe)
-    trainer = make_trainer(task, run_dir, state, overrides)
-    why = "error"
-    try:
-        why = trainer.run()
-    finally:
-        trainer.close(wait=why != "error")
-        with contextlib.suppress(OSError):  # the disk may be what ended it
-            end_session(
-                run_dir, why, env_steps=trainer.env_steps, wall_s=trainer.wall_s
+    with reported(hold.path):
+        with interruptible():
+            trainer = make_trainer(
+                task, hold.path, state, overrides, changed=changed, hold=hold
             )
+        why = "error"
+        try:
+            why = trainer.run()
+        finally:
+            _end(trainer, hold, why)
     _LOG.info("ended after %d env steps: %s", trainer.env_steps, why)
-    return run_dir
+    return hold.path
+
+
+def _end(trainer: Trainer, hold: RunHold, why: str) -> None:
+    """Close what is open; a run that fails already keeps its own error."""
+    quiet = [] if why != "error" else [OSError, RunError]
+    with contextlib.suppress(*quiet):
+        trainer.close(wait=why != "error")
+    try:
+        hold.check()
+        end_session(hold.path, why, env_steps=trainer.env_steps, wall_s=trainer.wall_s)
+    # the disk may be what ended it, or the folder is no longer there
+    except (OSError, RunError) as error:
+        _LOG.warning("the end of the session is not recorded: %s", error)
 
 
 def make_trainer(
@@ -224,26 +247,31 @@ def make_trainer(
     run_dir: Path,
     state: dict[str, Any] | None = None,
     overrides: list[str] | None = None,
+    *,
+    changed: bool = False,
+    hold: RunHold | None = None,
 ) -> Trainer:
     """Build the trainer of a session, and write the session's first line.
+
+    ``changed``: the overrides are not in the stored recipe yet. ``hold``: of the
+    folder, for the trainer to look after.
 
     Raises:
         RunError: the checkpoint does not fit the recipe; nothing is changed then.
     """
-    overrides = overrides or []
     torch.manual_seed(task.recipe.seed)
     env = task.make_env()
     learner = task.make_learner(env)
     if state is not None:
         restore(learner, state, worlds_key=task.worlds_key)
-    if overrides:
-        write_atomic(run_dir / RECIPE, dump_recipe(task.recipe))
-    task.prepare(run_dir, env, changed=bool(overrides))
+    if changed:
+        write_recipe(run_dir, dump_recipe(task.recipe))
+    task.prepare(run_dir, env, changed=changed)
     start = begin_session(
         run_dir,
         env_steps=state["env_steps"] if state else 0,
         wall_s=state["wall_s"] if state else 0.0,
-        overrides=overrides,
+        overrides=overrides or [],
     )
     log = MetricLog(
         run_dir,
@@ -253,7 +281,9 @@ def make_trainer(
     )
     replay = _open_replay(task, run_dir, learner, state)
     task.begin(start, state)
-    trainer = Trainer(task, run_dir, learner, log, start=start, replay=replay)
+    trainer = Trainer(
+        task, run_dir, learner, log, start=start, replay=replay, hold=hold
+    )
     if state is not None:
         trainer.load_state_dict(state)
     return trainer
@@ -265,9 +295,14 @@ def restore(learner: Learner, state: dict[str, Any], *, worlds_key: str) -> None
     Raises:
         RunError: it is of other networks, observations or worlds.
     """
+    _load(learner, state["learner"], worlds_key=worlds_key)
+    learner.forget_episodes()
+
+
+def _load(learner: Learner, state: dict[str, Any], *, worlds_key: str) -> None:
     try:
-        learner.load_state_dict(state["learner"])
-    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        learner.load_state_dict(state)
+    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
         # torch names every tensor that differs; the first one tells enough
         lines = [line.strip() for line in str(error).splitlines()]
         fault = " ".join(lines[:2])
@@ -277,7 +312,6 @@ def restore(learner: Learner, state: dict[str, Any], *, worlds_key: str) -> None
             f"({fault}{' ...' if len(lines) > 2 else ''}). Leave the override out, use "
             "that version, or start a new run."
         ) from error
-    learner.forget_episodes()
 
 
 def _open_replay(
@@ -316,10 +350,14 @@ def reopen(path: str | Path) -> tuple[Learner, Callable[[], TensorDictBase]]:
     with TemporaryDirectory() as folder:
         file = Path(folder) / RECIPE
         file.write_text(dump["recipe"], encoding="utf-8")
-        recipe = load_recipe(file)
+        try:
+            recipe = load_recipe(file)
+        except RecipeError as error:
+            where = f"{path}, its recipe"
+            raise RecipeError(error.problems, where=where) from error
     task = task_of(recipe).open(recipe)
     learner = task.make_learner(task.make_env())
-    learner.load_state_dict(dump["learner"])
+    _load(learner, dump["learner"], worlds_key=task.worlds_key)
     update = dump["update"]
     if update is None:
         raise RunError(f"{path}: holds no batch; this learner keeps none.")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,11 +19,17 @@ from flashdex.algorithms import find_algorithm
 from flashdex.errors import RunError
 from flashdex.recipe import RunRecipe
 from flashdex.rollouts.ledger import CONVERSIONS
+from flashdex.system.files import own_file
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
-from flashdex.training.logging import METRICS
+from flashdex.system.run_files import (
+    SESSIONS,
+    line_counts,
+    read_metrics,
+    read_sessions,
+    run_id,
+)
 
 _LOG = logging.getLogger(__name__)
-SESSIONS = "sessions.jsonl"
 LABELS = ("name", "ablation", "seed", "run_dir")  # of the records so far
 SIGNAL = "signal"  # why a session ended, when a person or a scheduler ended it
 
@@ -33,6 +41,7 @@ class SessionStart:
     env_steps: int  # of the checkpoint, 0 without one
     wall_s: float  # s of the run so far, those after the checkpoint included
     lost: int  # env steps of all sessions that no checkpoint kept
+    run: str = ""  # what tells the run from others; empty in those of older versions
 
 
 def begin_session(
@@ -44,8 +53,9 @@ def begin_session(
     latest moment that any file of the run knows of. Env steps beyond the checkpoint
     were simulated for nothing and are added up.
     """
-    drop_cut_line(run_dir / SESSIONS)
-    before = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "start"]
+    path = own_file(run_dir, SESSIONS)
+    drop_cut_line(path)
+    before = [s for s in read_sessions(run_dir) if s["event"] == "start"]
     since = before[-1]["wall_s"] if before else 0.0
     seen = _seen(run_dir)
     # What an earlier resume has counted already was written before that resume.
@@ -55,6 +65,7 @@ def begin_session(
         env_steps=env_steps,
         wall_s=max([wall_s, since, *(wall for _, wall in seen)]),
         lost=lost + (before[-1]["env_steps_lost"] if before else 0),
+        run=run_id(run_dir),
     )
     line = {
         "event": "start",
@@ -63,8 +74,9 @@ def begin_session(
         "wall_s": start.wall_s,
         "env_steps_lost": start.lost,
         "overrides": overrides,
+        "run": start.run,
     }
-    append_line(run_dir / SESSIONS, line)
+    append_line(path, line)
     return start
 
 
@@ -72,22 +84,23 @@ def end_session(run_dir: Path, why: str, *, env_steps: int, wall_s: float) -> No
     """Write the ``end`` line; a session without one crashed, or is running."""
     counters = {"env_steps": env_steps, "wall_s": wall_s}
     line = {"event": "end", "date": _now(), **counters, "why": why}
-    append_line(run_dir / SESSIONS, line)
+    line["lines"] = line_counts(run_dir)
+    append_line(own_file(run_dir, SESSIONS), line)
 
 
 def ended_by(run_dir: Path) -> str:
     """Why the newest session ended, empty when it has not."""
-    lines = read_lines(run_dir / SESSIONS)
+    lines = read_sessions(run_dir)
     return lines[-1].get("why", "") if lines else ""
 
 
 def _seen(run_dir: Path) -> list[tuple[int, float]]:
     """Env steps and clock, s, of every record of a run."""
-    metrics: list[dict[str, Any]] = read_lines(run_dir / METRICS)
+    metrics = read_metrics(run_dir)
     out = [(int(r["env_steps"]), 3600.0 * r["hours"]) for r in metrics]
     lines = read_lines(run_dir / CONVERSIONS)
     out += [(int(r["env_steps"]), float(r["wall_s"])) for r in lines]
-    ends = [s for s in read_lines(run_dir / SESSIONS) if s["event"] == "end"]
+    ends = [s for s in read_sessions(run_dir) if s["event"] == "end"]
     return out + [(int(s["env_steps"]), float(s["wall_s"])) for s in ends]
 
 
@@ -130,6 +143,7 @@ class StopSignals:
 
     A second Ctrl-C raises KeyboardInterrupt where it falls. A second SIGTERM does
     nothing: schedulers repeat it, and it must not cost the checkpoint being written.
+    With ``at_once`` the first Ctrl-C raises, and nothing else is noted.
 
     Example:
         >>> with StopSignals() as stop:
@@ -137,12 +151,15 @@ class StopSignals:
         False
     """
 
-    def __init__(self) -> None:
-        self.requested = False
+    def __init__(self, *, at_once: bool = False) -> None:
+        self.requested, self.at_once = False, at_once
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
         names = [signal.SIGINT, signal.SIGTERM]
+        if self.at_once:  # the others end the process, as ever
+            self._before = {signal.SIGINT: signal.signal(signal.SIGINT, self._note)}
+            return self
         hangup = getattr(signal, "SIGHUP", None)
         # nohup ignores it, and is taken at its word
         if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
@@ -155,8 +172,21 @@ class StopSignals:
             signal.signal(name, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.requested and number == signal.SIGINT:
+        if self.at_once or (self.requested and number == signal.SIGINT):
+            self.requested = True
             raise KeyboardInterrupt
         if not self.requested:
             _LOG.info("stopping after this step; Ctrl-C again stops at once")
         self.requested = True
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End a block without a loop on Ctrl-C, at the latest where it is left.
+
+    The exception falls anywhere, also into a callback of a library that drops it.
+    """
+    with StopSignals(at_once=True) as stop:
+        yield
+    if stop.requested:
+        raise KeyboardInterrupt

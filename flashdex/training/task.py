@@ -58,6 +58,9 @@ class Task(Protocol):
         """Make the algorithm of the recipe."""
         ...
 
+    def check_inputs(self, run_dir: Path) -> None:
+        """Refuse what is not what the run began with, by content."""
+
     def prepare(self, run_dir: Path, env: Any, *, changed: bool) -> None:
         """Open what may refuse a session; ``changed``: overrides were given."""
 

@@ -18,7 +18,6 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.scene.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.modules.layers import restore_generator
@@ -27,8 +26,9 @@ from flashdex.replay.buffer import check_pinning
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, ScorerSpec
-from flashdex.rollouts.truth import library_hashes
+from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.machine import versions
+from flashdex.system.run_files import BASELINES, MOTIONS
 from flashdex.training.baselines import score_baselines
 from flashdex.training.build import RunBuilder, learner_device
 from flashdex.training.checkpoint import EVALUATED, RESUMED
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from flashdex.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)
-BASELINES = "baselines.json"
 _ROOM = {"contacts": "physics.nconmax", "constraints": "physics.njmax"}
 
 
@@ -86,7 +85,7 @@ class TrackingTask(Task):
         recipe = dump_recipe(self.recipe).encode()
         return {
             "recipe_sha256": hashlib.sha256(recipe).hexdigest(),
-            "library_sha256": library_hashes(self.builder.library)[0],
+            "library_sha256": self.builder.library.content_hash,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
 
@@ -104,12 +103,39 @@ class TrackingTask(Task):
         text = json.dumps(rows, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def check_inputs(self, run_dir: Path) -> None:
+        """Refuse motions that have the names of the run's, and are others.
+
+        Raises:
+            RunError: the library was changed or exchanged.
+        """
+        known = read_object(run_dir, MOTIONS).get("motions", {})
+        now = self._contents
+        others = [name for name in now if known.get(name, now[name]) != now[name]]
+        if others:
+            raise RunError(
+                f"{self.builder.library.path}: {len(others)} of {len(now)} motions are "
+                f"not those that {run_dir} was trained on, {', '.join(others[:3])!a}: "
+                "the library was changed. Restore it, or start a new run."
+            )
+
+    @cached_property
+    def _contents(self) -> dict[str, str]:
+        """Hash of the content of each motion, by name."""
+        library = self.builder.library
+        return {n: library.motion_hash(row) for row, n in enumerate(library.names)}
+
+    def _remember_motions(self, run_dir: Path) -> None:
+        known = read_object(run_dir, MOTIONS).get("motions", {})
+        if not self._contents.keys() <= known.keys():
+            everything = {"motions": {**known, **self._contents}}
+            write_object(everything, run_dir, MOTIONS)
+
     def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
-        """Score the baselines, anew where the recipe changed, and open the ledger."""
+        """Score the baselines, what is new of them, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)
-        if changed:
-            (run_dir / BASELINES).unlink(missing_ok=True)
+        self._remember_motions(run_dir)
         baselines = score_baselines(self.builder, run_dir / BASELINES)
         self.ledger = open_ledger(
             self.builder,
@@ -283,9 +309,8 @@ def open_ledger(
 def make_inline_scorer(spec: ScorerSpec) -> InlineScorer:
     """Build the scorer of the scoring process."""
     builder = RunBuilder.from_recipe(spec.recipe, device=torch.device("cpu"))
-    scenes = build_scenes(builder.library, builder.hands, spec.recipe.physics)
     rollouts = builder.rollout_builder(
-        scenes, made_by=spec.made_by, provenance=spec.provenance
+        builder.scenes, made_by=spec.made_by, provenance=spec.provenance
     )
     ledger = open_ledger(builder, spec.run_dir, spec.trivial, on_gpu=spec.on_gpu)
     return InlineScorer(ledger, rollouts)

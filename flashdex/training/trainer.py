@@ -21,11 +21,13 @@ from flashdex.algorithms.base import Learner
 from flashdex.errors import RunError
 from flashdex.recipe import dump_recipe
 from flashdex.replay.disk import ReplayLog
+from flashdex.system.files import RunHold
+from flashdex.system.run_files import METRICS
+from flashdex.system.tensors import first_non_finite
 from flashdex.training.checkpoint import save_checkpoint
 from flashdex.training.guard import (
     GradientGuard,
     NonFiniteError,
-    first_non_finite,
     numeric_errors,
     stop_with_dump,
 )
@@ -126,10 +128,11 @@ class Trainer:
         *,
         start: SessionStart,
         replay: ReplayLog | None = None,
+        hold: RunHold | None = None,
     ) -> None:
         self.task, self.recipe, self.env = task, task.recipe, task.env
         self.run_dir, self.learner, self.log = run_dir, learner, log
-        self.start, self.replay = start, replay
+        self.start, self.replay, self.hold = start, replay, hold
         self.stats, self.guard = RunningStats(), GradientGuard()
         self.stop = StopSignals()
         self.learns_beside = task.updates_during_step and learner.is_off_policy
@@ -210,6 +213,7 @@ class Trainer:
 
     def vector_step(self, td: TensorDictBase) -> TensorDictBase:
         """One step of all worlds, with the updates that belong to it."""
+        self._look_after_folder()
         with self.stats.time("act"):
             action = self.learner.act(self._state_of(td))
             self.env.put_action(td, action)
@@ -228,6 +232,11 @@ class Trainer:
         self.task.after_step(self, after)
         with self.stats.time("reset"):
             return self._advance(td, after[keys.DONE])
+
+    def _look_after_folder(self) -> None:
+        """Before anything is written: the folder may have been moved meanwhile."""
+        if self.hold is not None:
+            self.hold.check()
 
     def _advance(self, td: TensorDictBase, done: Tensor) -> TensorDictBase:
         if self.env.is_host_device and not done.any():
@@ -306,6 +315,7 @@ class Trainer:
         if self.env_steps == self._saved_at:
             return
         self.guard.check()
+        self._look_after_folder()
         lost = self.task.settle(self)
         state = self.state_dict()
         if bad := first_non_finite(state["learner"]):
@@ -327,12 +337,20 @@ class Trainer:
             "torch_rng": torch.get_rng_state(),
             "recipe": dump_recipe(self.recipe),
             "wandb_id": self.log.wandb_id,
+            "records": self.log.lines.count,
+            "run": self.start.run,
             **self.task.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore all of ``state_dict`` but the learner, which is restored already."""
         self.vector_steps = state.get("vector_steps", 0)
+        if self.log.lines.count < state.get("records", 0):
+            _LOG.warning(
+                "%s is shorter than at the checkpoint: %d records are missing",
+                self.run_dir / METRICS,
+                state["records"] - self.log.lines.count,
+            )
         self.task.load_state_dict(state)
         if "torch_rng" in state:
             torch.set_rng_state(state["torch_rng"])

@@ -233,7 +233,7 @@ def test_a_line_cut_by_a_crash_is_left_out_and_a_broken_one_is_named(run_dir):
     with pytest.raises(RunError, match=r"conversions\.jsonl: line 1 is not JSON"):
         write_report(run_dir)
     path.write_text('{"motion": "push"}\n' + whole)
-    with pytest.raises(RunError, match="line 1 lacks converted, errors"):
+    with pytest.raises(RunError, match="line 1 lacks 'converted'"):
         write_report(run_dir)
 
 

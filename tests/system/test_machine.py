@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 
 import pytest
 
+from flashdex.system import machine
 from flashdex.system.machine import free_host, look_at_machine
 
 GB = 10**9
@@ -66,3 +68,66 @@ def test_a_run_directory_need_not_exist(tmp_path):
     assert machine.disk == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.05)
     assert machine.host is not None
     assert machine.free("host") == machine.host
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A git checkout with one changed file, taken for flashdex's own."""
+    words = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+
+    def git(*more):
+        subprocess.run(["git", "-C", str(tmp_path), *words, *more], check=True)
+
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "code.py").write_text("one\n")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "one")
+    (tmp_path / "code.py").write_text("two\n")
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "a" / "b" / "machine.py"))
+    return tmp_path, git
+
+
+def test_changes_are_kept_and_no_command_of_the_repository_runs(checkout):
+    folder, git = checkout
+    trap = folder / "trap.sh"
+    trap.write_text(f"#!/bin/sh\ntouch {folder}/sprung\n")
+    trap.chmod(0o755)
+    (folder / ".git/info/attributes").write_text("*.py diff=evil\n")
+    for key in ("diff.external", "diff.evil.textconv", "core.fsmonitor"):
+        git("config", key, str(trap))
+    assert b"+two" in machine.source_changes()
+    assert not (folder / "sprung").exists()
+
+
+@pytest.mark.parametrize(
+    "content", [b"\0\xff" * 50, b"\xe9\n" * 50], ids=["binary", "latin-1"]
+)
+def test_changes_of_any_content_end_nothing(checkout, content):
+    (checkout[0] / "code.py").write_bytes(content)
+    assert machine.source_changes()
+
+
+def test_long_changes_are_cut_off(checkout, monkeypatch):
+    monkeypatch.setattr(machine, "DIFF_BYTES", 1000)
+    (checkout[0] / "code.py").write_text("line\n" * 1000)
+    found = machine.source_changes()
+    assert len(found) < 1100
+    assert found.endswith(b"(cut off)\n")
+
+
+@pytest.mark.parametrize(
+    "fault", [FileNotFoundError, subprocess.TimeoutExpired("git", 10)]
+)
+def test_a_git_that_is_missing_or_slow_ends_nothing(checkout, monkeypatch, fault):
+    def fail(*args, **options):
+        raise fault
+
+    monkeypatch.setattr(subprocess, "run", fail)
+    assert machine.source_changes() == b""
+
+
+def test_variables_for_git_name_no_other_repository(checkout, monkeypatch, tmp_path):
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "other"))
+    monkeypatch.setenv("GIT_EXTERNAL_DIFF", "/bin/false")
+    assert b"+two" in machine.source_changes()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.recipe import GymRecipe, LoopConfig
+from flashdex.system.jsonl import read_lines
 from flashdex.training.gym import GymTask
 from flashdex.training.run_dir import make_trainer
 
@@ -54,4 +53,4 @@ def learner_of(recipe):
 
 
 def read_metrics(folder):
-    return [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]
+    return read_lines(folder / "metrics.jsonl")

@@ -6,15 +6,16 @@ import dataclasses
 import json
 
 import pytest
-import torch
 
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.cli.main import main
 from flashdex.errors import RunError
 from flashdex.recipe import Recipe, dump_recipe
 from flashdex.system.files import run_lock
+from flashdex.system.run_files import RECIPE, new_run
+from flashdex.system.tensors import write_tensors
 from flashdex.training.checkpoint import RESUMED, load_checkpoint
-from flashdex.training.run_dir import RECIPE, new_run, resume
+from flashdex.training.run_dir import resume
 from flashdex.training.session import refuse_changes
 
 CHANGES = {
@@ -82,16 +83,23 @@ def test_an_evaluation_with_other_networks_is_refused_in_one_line(train_tiny, ca
 def test_a_resume_asks_for_exactly_what_a_checkpoint_holds(train_tiny):
     run_dir = train_tiny()
     state = load_checkpoint(run_dir)
-    assert set(state) == {*RESUMED, "format", "env_steps_lost"}
+    assert set(state) == {
+        *RESUMED,
+        "format",
+        "sealed",
+        "run",
+        "records",
+        "env_steps_lost",
+    }
     (path,) = (run_dir / "checkpoints").glob("*.pt")
     del state["torch_rng"], state["assist_epoch"]
-    torch.save(state, path)
+    write_tensors(state, run_dir, "checkpoints", path.name)
     with pytest.raises(RunError, match=r"lacks assist_epoch, torch_rng\."):
         resume(run_dir)
 
 
 def start(folder, **fields):
-    with new_run(folder, dataclasses.replace(RUN, **fields)):
+    with new_run(folder, dump_recipe(dataclasses.replace(RUN, **fields))):
         return (folder / RECIPE).read_text()
 
 
@@ -109,6 +117,9 @@ def test_a_new_run_needs_a_folder_of_its_own(tmp_path):
 
 
 def test_a_new_run_is_held_while_it_trains(tmp_path):
-    with new_run(tmp_path, RUN), pytest.raises(RunError, match="another process"):
+    with (
+        new_run(tmp_path, dump_recipe(RUN)),
+        pytest.raises(RunError, match="another process"),
+    ):
         start(tmp_path, seed=9)
     assert f"seed: {RUN.seed}\n" in (tmp_path / RECIPE).read_text()

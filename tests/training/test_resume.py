@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import copy
 import csv
+import errno
 import itertools
-import json
 import os
 import signal
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 import torch
 
 from flashdex.cli.main import main
 from flashdex.errors import RunError
+from flashdex.motions.library import MotionLibrary
 from flashdex.replay.disk import ReplayLog
 from flashdex.rollouts.ledger import CONVERSIONS, Ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import run_lock
-from flashdex.system.jsonl import append_line, keep_lines, read_lines
+from flashdex.system.jsonl import append_line, keep_lines, read_lines, read_object
+from flashdex.system.run_files import MOTIONS, SESSIONS
+from flashdex.training import checkpoint
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
-from flashdex.training.run_dir import resume
+from flashdex.training.run_dir import evaluate, resume
 from flashdex.training.session import (
-    SESSIONS,
     StopSignals,
     begin_session,
     end_session,
     ended_by,
+    interruptible,
 )
 
 KEYS = ("env_steps", "hours", "updates")
@@ -177,10 +180,14 @@ def test_two_processes_never_share_a_run(train_tiny):
         resume(run_dir)
 
 
-def test_a_run_outlives_a_checkpoint_that_fails(start_tiny, tmp_path, caplog):
+def test_a_run_outlives_a_checkpoint_that_fails(
+    start_tiny, tmp_path, caplog, monkeypatch
+):
+    def fail(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_tensors", fail)
     run_dir = tmp_path / "run"
-    run_dir.mkdir()
-    (run_dir / "checkpoints").write_text("in the way")
     with pytest.raises(RunError, match="cannot be written"):
         start_tiny(run_dir, train={"checkpoint_every_s": 1e-9})
     assert "no checkpoint this time, the run goes on" in caplog.text
@@ -266,8 +273,9 @@ def open_ledger(folder, library, **changes):
 def cut_line(folder):
     path = folder / CONVERSIONS
     lines = path.read_text().splitlines(keepends=True)
+    (*_, line) = read_lines(path)
     path.write_text("".join(lines[:-1]))
-    return json.loads(lines[-1])
+    return line
 
 
 @pytest.mark.parametrize("certificate", [True, False])
@@ -310,3 +318,40 @@ def test_a_rollout_that_does_not_pass_is_not_adopted(tmp_path, library, passing)
     again = open_ledger(tmp_path, library)
     assert again.adopt(wall_s=9.0) == []
     assert read_lines(tmp_path / CONVERSIONS) == []
+
+
+@pytest.mark.parametrize("dropped", [True, False])
+def test_ctrl_c_is_not_lost_in_a_library_that_drops_it(dropped):
+    reached = []
+
+    @interruptible()
+    def load():
+        # as a callback from C does
+        with suppress(KeyboardInterrupt if dropped else ()):
+            signal.raise_signal(signal.SIGINT)
+        reached.append("the end of the block")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert len(reached) == dropped
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_motions_are_known_by_their_content(train_tiny, library, monkeypatch):
+    contents = {name: f"hash of {name}" for name in library.names}
+    monkeypatch.setattr(
+        MotionLibrary,
+        "motion_hash",
+        lambda self, row: contents[self.names[row]],
+        raising=False,
+    )
+    run_dir = train_tiny(seed=5)  # trained now, under these hashes
+    assert read_object(run_dir, MOTIONS) == {"motions": contents}
+    resume(run_dir, ["total_env_steps=366"])
+    contents["both"] = "another motion of that name"
+    kept = {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()}
+    for use in (resume, evaluate):
+        with pytest.raises(RunError, match="1 of 3 motions are not those"):
+            use(run_dir)
+    assert {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()} == kept
+    evaluate(run_dir, [f"motions.library={library.path}"])  # asked for by name

@@ -10,8 +10,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from flashdex.errors import RunError
+from flashdex.system.files import open_plain, own_file, own_folder
+from flashdex.system.run_files import FILMS as FOLDER
+
 _LOG = logging.getLogger(__name__)
-FOLDER = "films"
+MAX_BYTES = 64 << 20  # of one film; they have half a megabyte
 NO_GRAPHICS = "no pictures: install libosmesa6 or libegl1"
 _SECONDS_A_FILM = 120
 _PROBE = (
@@ -40,11 +44,38 @@ class Film:
         """Where the pictures of ``rollouts/<motion>.npz`` of a run lie."""
         return cls.at(rollout.parent.parent / FOLDER / rollout.stem)
 
+    @property
+    def files(self) -> dict[Path, tuple[str, bytes]]:
+        """Each file, with its type and what stands at the beginning of such files."""
+        picture = ("image/png", b"\x89PNG\r\n\x1a\n")
+        films = {self.video: ("video/mp4", b"ftyp")}
+        return {**films, self.stills: picture, self.poster: picture}
+
+    @property
+    def is_whole(self) -> bool:
+        """All files are there and what they should be: a page may show them."""
+        return all(self.read(path) for path in self.files)
+
+    def read(self, path: Path) -> bytes:
+        """One of the files, empty where it is missing, too large or something else.
+
+        Raises:
+            RunError: it is a link, or no file.
+        """
+        own = own_file(path.parent.parent, path.parent.name, path.name)
+        _, mark = self.files[path]
+        try:
+            with open_plain(own) as file:
+                content = file.read(MAX_BYTES + 1)
+        except OSError:
+            return b""
+        is_right = mark in content[:12] and len(content) <= MAX_BYTES
+        return content if is_right else b""
+
     def is_newer_than(self, rollout: Path) -> bool:
         """All files exist and were drawn after the rollout was stored."""
-        files = (self.video, self.stills, self.poster)
         stored = rollout.stat().st_mtime
-        return all(f.is_file() and f.stat().st_mtime >= stored for f in files)
+        return all(f.is_file() and f.stat().st_mtime >= stored for f in self.files)
 
 
 def draw_films(rollouts: list[Path]) -> str:
@@ -53,6 +84,13 @@ def draw_films(rollouts: list[Path]) -> str:
     Returns why pictures are missing, empty when all are there. Never raises: a run is
     worth reporting without pictures.
     """
+    try:
+        return _draw_films(rollouts)
+    except (OSError, RunError) as error:
+        return f"no pictures: {error}"
+
+
+def _draw_films(rollouts: list[Path]) -> str:
     todo = [r for r in rollouts if r.is_file() and not Film.of(r).is_newer_than(r)]
     if not todo:
         return ""
@@ -60,7 +98,7 @@ def draw_films(rollouts: list[Path]) -> str:
     if backend is None:
         return NO_GRAPHICS
     _LOG.info("drawing %d films", len(todo))
-    folder = Film.of(todo[0]).video.parent
+    folder = own_folder(todo[0].parent.parent, FOLDER)
     words = ["-m", "flashdex.reports.render.rollout", *map(str, todo), str(folder)]
     fault = run_drawer(words, backend, timeout=60 + _SECONDS_A_FILM * len(todo))
     missing = [r.stem for r in todo if not Film.of(r).is_newer_than(r)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -15,6 +16,7 @@ from PIL import Image
 from flashdex.reports.render.films import Film
 from flashdex.reports.render.scene import ScenePainter, draw_each, update_poses
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.files import open_atomic
 from flashdex.system.mjcf import check_mjcf
 
 WIDTH, HEIGHT = 512, 384  # multiples of 16, as the encoder wants them
@@ -97,6 +99,7 @@ def _add_ghost(
 def write_film(rollout: Rollout, film: Film) -> None:
     """Write the film in real time, its first picture and a strip of stills."""
     film.video.parent.mkdir(parents=True, exist_ok=True)
+    half = film.video.with_name(f".{film.video.stem}.{os.getpid()}.tmp.mp4")
     stride = max(1, round(rollout.fps / FILM_FPS))
     last = rollout.num_frames - 1
     painter = Painter(rollout)
@@ -104,11 +107,15 @@ def write_film(rollout: Rollout, film: Film) -> None:
         spread = np.linspace(0, last, NUM_STILLS).round().astype(int).tolist()
         stills = [Image.fromarray(painter.draw(t)) for t in spread]
         frames = (painter.draw(t) for t in range(0, rollout.num_frames, stride))
-        _write_mp4(frames, film.video, fps=rollout.fps / stride)
+        _write_mp4(frames, half, fps=rollout.fps / stride)
+        os.replace(half, film.video)  # takes the place of a link, follows none
     finally:
+        half.unlink(missing_ok=True)
         painter.close()
-    stills[0].save(film.poster, optimize=True)
-    _side_by_side(stills).save(film.stills, optimize=True)
+    pictures = {film.poster: stills[0], film.stills: _side_by_side(stills)}
+    for path, picture in pictures.items():
+        with open_atomic(path) as file:
+            picture.save(file, "png", optimize=True)
 
 
 def _side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:

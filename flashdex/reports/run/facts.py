@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,9 +13,28 @@ import yaml
 from flashdex.errors import RunError, UnknownNameError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
+from flashdex.system.files import own_files
+from flashdex.system.jsonl import Schema, read_lines, read_object
+from flashdex.system.run_files import (
+    BASELINES,
+    CONVERSIONS,
+    RECIPE,
+    ROLLOUTS,
+    VERSIONS,
+    check_run,
+    check_sessions,
+    read_metrics,
+    read_recipe,
+)
 
 Line = dict[str, Any]
-ATTEMPT_KEYS = ("motion", "converted", "errors", "env_steps", "wall_s")
+ATTEMPT: Schema = {
+    "motion": str,
+    "converted": bool,
+    "errors": dict,
+    "env_steps": int,
+    "wall_s": float,
+}
 
 
 @dataclass(frozen=True)
@@ -64,12 +82,10 @@ def load_run(run_dir: str | Path) -> RunData:
         RunError: this is no run directory, or a file in it is broken.
     """
     path = Path(run_dir)
-    recipe = path / "recipe.yaml"
-    if not recipe.is_file():
-        raise RunError(
-            f"{path}: not a run directory, there is no recipe.yaml in it. Give the "
-            "folder that 'flashdex train' wrote, usually runs/<name>."
-        )
+    recipe = path / RECIPE
+    read_recipe(path)  # refuses what is none, or was changed
+    check_run(path)
+    check_sessions(path)
     try:
         composed = yaml.safe_load(recipe.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
@@ -77,46 +93,36 @@ def load_run(run_dir: str | Path) -> RunData:
     return RunData(
         path=path,
         recipe=composed if isinstance(composed, dict) else {},
-        versions=_read_json(path / "versions.json"),
-        metrics=_drop_repeated(
-            _read_lines(path / "metrics.jsonl", needs=("env_steps",))
-        ),
-        attempts=_read_lines(path / "conversions.jsonl", needs=ATTEMPT_KEYS),
-        baselines=_read_json(path / "baselines.json"),
-        certificates=_certificates(path / "rollouts"),
+        versions=read_object(path, VERSIONS),
+        metrics=_drop_repeated(read_metrics(path)),
+        attempts=read_lines(path / CONVERSIONS, ATTEMPT),
+        baselines=_baselines(path),
+        certificates=_certificates(path),
     )
 
 
-def _read_json(path: Path) -> Line:
-    """A JSON object; a file that does not exist is an empty one."""
-    if not path.is_file():
-        return {}
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RunError(f"{path}: not JSON ({error}). Restore or remove it.") from error
-    if not isinstance(found, dict):
-        raise RunError(f"{path}: not a JSON object. Restore or remove it.")
-    return found
+def _baselines(path: Path) -> dict[str, dict[str, Line]]:
+    """Scores by baseline and motion.
 
-
-def _read_lines(path: Path, *, needs: tuple[str, ...]) -> list[Line]:
-    """JSON lines with these keys; a last line that a crash cut off is left out."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    found = []
-    for number, text in enumerate(lines, start=1):
-        where = f"{path}: line {number}"
-        try:
-            line = json.loads(text)
-        except ValueError as error:
-            if number == len(lines):
-                break
-            fault = f"{where} is not JSON ({error}). Remove the line."
-            raise RunError(fault) from error
-        absent = [key for key in needs if not isinstance(line, dict) or key not in line]
-        if absent:
-            raise RunError(f"{where} lacks {', '.join(absent)}. Remove the line.")
-        found.append(line)
+    Raises:
+        RunError: the file says something else.
+    """
+    found = read_object(path, BASELINES)
+    rows = [
+        row
+        for motions in found.values()
+        if isinstance(motions, dict)
+        for row in motions.values()
+    ]
+    if not all(isinstance(m, dict) for m in found.values()) or not all(
+        isinstance(row, dict)
+        and isinstance(row.get("errors", {}), dict)
+        and all(type(v) in (int, float) for v in row.get("errors", {}).values())
+        for row in rows
+    ):
+        raise RunError(
+            f"{path / BASELINES}: holds no scores of baselines. Restore or remove it."
+        )
     return found
 
 
@@ -129,12 +135,13 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
     return kept[::-1]
 
 
-def _certificates(folder: Path) -> dict[str, Line]:
+def _certificates(run_dir: Path) -> dict[str, Line]:
     found = {}
-    for path in sorted(folder.glob("*.certificate.json")):
-        certificate = _read_json(path)
-        name = certificate.get("identity", {}).get("motion")
-        found[name or path.name.removesuffix(".certificate.json")] = certificate
+    for path in own_files(run_dir, ROLLOUTS, "*.certificate.json"):
+        certificate = read_object(run_dir, ROLLOUTS, path.name)
+        identity = certificate.get("identity")
+        name = identity.get("motion") if isinstance(identity, dict) else None
+        found[str(name or path.name.removesuffix(".certificate.json"))] = certificate
     return found
 
 

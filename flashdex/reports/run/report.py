@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from flashdex.errors import RunError
@@ -23,8 +24,8 @@ from flashdex.reports.run.facts import (
 from flashdex.reports.text import NOTHING, number
 from flashdex.rollouts.ledger import rollout_name
 from flashdex.system.files import own_file
+from flashdex.system.run_files import REPORT
 
-REPORT = "report.html"
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
 BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
 Cell = tuple[str, str]  # text, and "good" or "bad" where it is marked
@@ -37,6 +38,8 @@ def write_report(run_dir: str | Path) -> Path:
         RunError: this is no run directory, or it cannot be written.
     """
     run = load_run(run_dir)
+    if not os.access(run.path, os.W_OK):  # said before films are drawn
+        raise RunError(f"{run.path}: cannot be written, so there is no {REPORT}.")
     rows = motion_facts(run)
     total = num_motions(run, rows)
     stored = _stored_rollouts(run, rows)
@@ -45,7 +48,7 @@ def write_report(run_dir: str | Path) -> Path:
     films = [
         (row, film)
         for row in rows
-        if row.name in stored and (film := Film.of(stored[row.name])).video.is_file()
+        if row.name in stored and (film := Film.of(stored[row.name])).is_whole
     ]
     return write_page(
         run.path / REPORT,

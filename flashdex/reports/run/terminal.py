@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flashdex.errors import RunError
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.recipe import task_of_run
 from flashdex.reports.run.facts import (
@@ -227,4 +228,8 @@ def run_summary(run_dir: Path) -> str:
     """Table of a run; of one with motions, the report is written as well."""
     if task_of_run(run_dir) == "gym":
         return gym_run_table(run_dir)
-    return f"{run_table(run_dir)}\n\nreport: {write_report(run_dir)}"
+    table = run_table(run_dir)
+    try:
+        return f"{table}\n\nreport: {write_report(run_dir)}"
+    except RunError as error:  # the run is done, and its table is there
+        return f"{table}\n\nno report: {error}"

@@ -1,0 +1,295 @@
+"""The files of a run: what they are called, and one reader for each that is text.
+
+A run owns the regular files named here below its folder. It reads, writes, shows and
+deletes no others: not what a link of such a name leads to, nor what lies beside them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import os
+import re
+import stat
+import uuid
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from flashdex.errors import RunError
+from flashdex.system.files import (
+    LOCK,
+    RunHold,
+    open_own,
+    own_file,
+    read_own,
+    run_lock,
+)
+from flashdex.system.jsonl import (
+    Schema,
+    check_keys,
+    read_lines,
+    read_object,
+    write_object,
+)
+from flashdex.system.machine import source_changes, versions
+
+_LOG = logging.getLogger(__name__)
+
+RECIPE, VERSIONS, DIFF = "recipe.yaml", "versions.json", "git.diff"
+BASELINES, MOTIONS = "baselines.json", "motions.json"
+METRICS, CSV, SESSIONS = "metrics.jsonl", "metrics.csv", "sessions.jsonl"
+CONVERSIONS, EVALUATION = "conversions.jsonl", "evaluation.json"
+DUMP, REPORT = "nan_dump.pt", "report.html"
+FILES = (
+    *(RECIPE, VERSIONS, DIFF, BASELINES, MOTIONS, METRICS, CSV, SESSIONS, CONVERSIONS),
+    *(EVALUATION, DUMP, REPORT, LOCK),
+)
+CHECKPOINTS, REPLAY = "checkpoints", "checkpoints/replay"
+ROLLOUTS, FILMS, WANDB = "rollouts", "films", "wandb"
+FOLDERS = {  # -> names of its files; what else lies there is nobody's business
+    CHECKPOINTS: re.compile(r"\d{12}\.(pt|unreadable)"),
+    REPLAY: re.compile(r"\d{12}(\.json|-\d{1,6}\.pt)"),
+    ROLLOUTS: re.compile(r".+(\.npz|\.certificate\.json)"),
+    FILMS: re.compile(r".+(\.mp4|\.png)"),
+    WANDB: re.compile(r"(?!)"),  # all of it is W&B's
+}
+# a folder with one of them holds a run, or what is left of one
+TRACES = (RECIPE, SESSIONS, CONVERSIONS, METRICS, BASELINES, CHECKPOINTS)
+_HALF = re.compile(r"\.(.+)\.\d+\.tmp")  # what a killed process left half written
+_COUNTERS: Schema = {"env_steps": int, "wall_s": float}
+STARTED: Schema = {**_COUNTERS, "env_steps_lost": int, "overrides": list, "date": str}
+ENDED: Schema = {**_COUNTERS, "why": str, "date": str}
+
+
+def check_run(run_dir: Path) -> None:
+    """Refuse a folder in which something else stands where a run has its files.
+
+    Raises:
+        RunError: a link, a pipe, a folder or a file where the other one should be.
+    """
+    for name in FILES:
+        own_file(run_dir, name)
+    for folder, pattern in FOLDERS.items():
+        for name in _names(run_dir, folder):
+            if pattern.fullmatch(name):
+                own_file(run_dir, folder, name)
+
+
+def remove_temporaries(run_dir: Path) -> None:
+    """Delete the half-written files that a killed run left behind."""
+    known = re.compile("|".join(re.escape(name) for name in FILES))
+    for folder, pattern in {"": known, **FOLDERS}.items():
+        for name in _names(run_dir, folder):
+            half = _HALF.fullmatch(name)
+            if half is None or not pattern.fullmatch(half.group(1)):
+                continue
+            path = run_dir / folder / name
+            if stat.S_ISREG(path.lstat().st_mode):
+                path.unlink(missing_ok=True)
+
+
+def _names(run_dir: Path, folder: str) -> list[str]:
+    """Names in a folder of a run that is a folder itself, no link to one."""
+    path = run_dir
+    for part in Path(folder).parts:
+        path = path / part
+        mode = path.lstat().st_mode if os.path.lexists(path) else None
+        if mode is None:
+            return []
+        if not stat.S_ISDIR(mode):
+            raise RunError(
+                f"{path}: is no folder, or a link to one. A run uses only what lies in "
+                f"{run_dir}; put the folder itself there, or remove it."
+            )
+    with suppress(FileNotFoundError):
+        return sorted(os.listdir(path))
+    return []
+
+
+@contextmanager
+def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
+    """Make the folder of a new run and hold it; nobody else may start one in it.
+
+    The recipe, YAML, comes last: a folder with one is a run.
+
+    Raises:
+        RunError: it holds a run, another process is at it, or it cannot be written.
+    """
+    with reported(run_dir):
+        run_dir.mkdir(parents=True, exist_ok=True)
+    with hold_run(run_dir) as hold:
+        check_run(run_dir)
+        refuse_old_run(run_dir)  # another process may have just ended one
+        with reported(run_dir):
+            write_object({"run": uuid.uuid4().hex, **versions()}, run_dir, VERSIONS)
+            _keep_changes(run_dir)
+            write_recipe(run_dir, recipe)
+        yield hold
+
+
+def write_recipe(run_dir: Path, recipe: str) -> None:
+    """Store the recipe of a run, YAML, with its seal."""
+    with open_own(run_dir, RECIPE) as file:
+        file.write(seal_text(recipe).encode("utf-8"))
+
+
+def _keep_changes(run_dir: Path) -> None:
+    """Store what was not committed; a run does not need it."""
+    try:
+        if diff := source_changes():
+            with open_own(run_dir, DIFF) as file:
+                file.write(diff)
+    except OSError as error:
+        _LOG.warning("%s is not written: %s", DIFF, error)
+
+
+def refuse_old_run(run_dir: Path) -> None:
+    """Raise a RunError when the folder holds a run, or what is left of one."""
+    left = [name for name in TRACES if os.path.lexists(run_dir / name)]
+    if RECIPE in left:
+        raise RunError(
+            f"{run_dir}: already holds a run. Continue it with 'flashdex train "
+            f"--resume {run_dir}', or choose another folder with run_dir=..."
+        )
+    if left:
+        raise RunError(
+            f"{run_dir}: holds files of a run without its {RECIPE} "
+            f"({', '.join(left)}). Restore that (every checkpoint holds a copy), or "
+            "choose another folder with run_dir=..."
+        )
+
+
+@contextmanager
+def hold_run(run_dir: Path) -> Iterator[RunHold]:
+    """Hold a folder as ``run_lock`` does; one that cannot be written is reported."""
+    with ExitStack() as held:
+        with reported(run_dir):
+            hold = held.enter_context(run_lock(run_dir))
+        yield hold
+
+
+@contextmanager
+def reported(run_dir: Path) -> Iterator[None]:
+    """A folder that cannot be written is a mistake of the user."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{run_dir}: cannot be written ({error}). Make room, or choose another "
+            f"folder with run_dir=... What is stored is whole; if {RECIPE} is there, "
+            f"continue with 'flashdex train --resume {run_dir}'."
+        ) from error
+
+
+def seal_text(text: str) -> str:
+    """A text whose last line, a comment, is the SHA-256 of those above it."""
+    found = hashlib.sha256(text.encode("utf-8")).hexdigest()
+    return f"{text}# sha256 of the lines above: {found}\n"
+
+
+def read_recipe(run_dir: Path) -> str:
+    """The recipe of a run as YAML, the seal left out.
+
+    Raises:
+        RunError: it is missing, damaged, or not as flashdex wrote it.
+    """
+    text = read_own(run_dir, RECIPE)
+    if text is None:
+        raise RunError(
+            f"{run_dir}: not a run directory, there is no {RECIPE} in it. Give the "
+            "folder that 'flashdex train' wrote, usually runs/<name>."
+        )
+    body = text[: text.rfind("# sha256 of the lines above: ")]
+    if seal_text(body) == text:
+        return body
+    # runs of versions before the seals have no id, either
+    if body == text[:-1] and "run" not in read_object(run_dir, VERSIONS):
+        return text
+    raise RunError(
+        f"{run_dir / RECIPE}: was changed or damaged since flashdex wrote it. Restore "
+        "it (every checkpoint holds a copy), and give new values to --resume as "
+        "key=value."
+    )
+
+
+def run_id(run_dir: Path) -> str:
+    """What tells a run from every other one; empty for those of older versions.
+
+    Raises:
+        RunError: the file that says so is damaged.
+    """
+    found = read_object(run_dir, VERSIONS).get("run", "")
+    if not isinstance(found, str):
+        raise RunError(f"{run_dir / VERSIONS}: 'run' is not text. Restore the file.")
+    return found
+
+
+def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
+    """Records of ``metrics.jsonl``: finite numbers only.
+
+    Raises:
+        RunError: a line is damaged, changed, or of something else.
+    """
+    path = own_file(run_dir, METRICS)
+    records = read_lines(path, {"env_steps": float, "hours": float})
+    for number, record in enumerate(records, start=1):
+        for key, value in record.items():
+            if type(value) not in (int, float) or not math.isfinite(value):
+                raise RunError(
+                    f"{path}: line {number} has {value!r:.60} as '{key}', which is no "
+                    "finite number. Restore the file from a copy."
+                )
+    return records
+
+
+def read_sessions(run_dir: Path) -> list[dict[str, Any]]:
+    """Lines of ``sessions.jsonl``.
+
+    Raises:
+        RunError: a line is damaged, changed, or of something else.
+    """
+    path = own_file(run_dir, SESSIONS)
+    lines = read_lines(path, {"event": str})
+    for number, line in enumerate(lines, start=1):
+        schema = {"start": STARTED, "end": ENDED}.get(line["event"], {})
+        check_keys(line, schema, path, number)
+    return lines
+
+
+def line_counts(run_dir: Path) -> dict[str, int]:
+    """How many lines the files have that only grow while a session lasts."""
+    paths = {name: own_file(run_dir, name) for name in (METRICS, CONVERSIONS)}
+    return {name: len(read_lines(p)) for name, p in paths.items() if p.exists()}
+
+
+def check_sessions(run_dir: Path, *, counts: bool = True) -> None:
+    """Refuse a run whose other files are not those that its last session left.
+
+    The seals of a file do not tell that lines at its end, or all of it, are gone.
+
+    Args:
+        run_dir: the folder.
+        counts: look for lines that are missing, too.
+
+    Raises:
+        RunError: lines are missing, or ``versions.json`` is another run's.
+    """
+    lines = read_sessions(run_dir)
+    begun = next((x for x in reversed(lines) if x["event"] == "start"), {})
+    if begun.get("run", "") not in ("", run_id(run_dir)):
+        raise RunError(
+            f"{run_dir / VERSIONS}: is not that of this run, or is missing. Restore it "
+            "from a copy."
+        )
+    told = lines[-1].get("lines") if counts and lines else None
+    now = line_counts(run_dir) if told else {}
+    for name, count in (told or {}).items():
+        missing = count - now.get(name, 0)
+        if missing > 0:
+            raise RunError(
+                f"{run_dir / name}: {missing} lines are missing that were there when "
+                "the last session ended. Restore the file from a copy."
+            )

@@ -200,6 +200,8 @@ class _RunCheck:
         named = line.get("rollout")
         if named and named != rollout_name(line["motion"]):
             self.fault(where, f"names {named!a}, not the rollout of its motion")
+        if line.get("gpu_s", 0.0) not in (0.0, line["wall_s"]):
+            self.fault(where, f"gpu_s is {line['gpu_s']}, wall_s {line['wall_s']}")
         if line["converted"] != (line["criterion"] in line.get("passed", [])):
             self.fault(where, "converted is not what the passed criteria say")
         if self._baselines is not None and "trivial" in line:

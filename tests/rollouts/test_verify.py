@@ -153,6 +153,9 @@ LINES = {
         lambda x: [*x[:-1], {**x[-1], "motion": "both", "rollout": None}]
     ),
     "passed is a number": of_stored("passed", 5),
+    "passed is nothing": of_stored("passed", None),
+    "trivial is nothing": of_stored("trivial", None),
+    "lift is text": of_stored("lift_ratio", "high"),
     "trivial is a number": of_stored("trivial", 5),
     "rollout is a list": of_stored("rollout", [1]),
     "time is NaN": of_stored("wall_s", float("nan")),

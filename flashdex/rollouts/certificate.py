@@ -18,6 +18,7 @@ import numpy as np
 
 from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
+from flashdex.rollouts.findings import OLD, Finding, at, differences, short
 from flashdex.rollouts.resimulation import (
     PERTURBATION,
     Perturbation,
@@ -42,6 +43,8 @@ PROVEN = ("certified", "robust")  # verdicts of a conversion that holds
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
 # mm; the scored object positions and the stored states are copies of one another
 MISMATCH_MM = 1e-3
+# where a certificate was made: numbers of another processor differ in the last digits
+ELSEWHERE = ("identity.certified_by", "provenance.certified_on")
 BRIEF = ("state", "reason", "failing_frame", "values")  # of a perturbed verdict
 DEVIATION_M, DEVIATION_RAD = 1e-3, math.radians(1.0)
 
@@ -239,4 +242,39 @@ def _perturbed_part(
             {name: {k: getattr(v, k) for k in BRIEF} for name, v in run.items()}
             for run in runs
         ],
+    }
+
+
+def compare_certificates(
+    stored: dict[str, Any], new: dict[str, Any], file: str
+) -> list[Finding]:
+    """Every number of a stored certificate that is not that of a new one."""
+    schema = at(stored, "identity", "schema")
+    found: list[Finding] = []
+    if schema != CERTIFICATE_SCHEMA:
+        found.append(Finding(file, "hashes", OLD, is_fault=False))
+        stored, new = _old_part(stored), _old_part(new)
+        new["nominal"] = {k: new["nominal"].get(k) for k in stored["nominal"]}
+    here = [at(new, *name.split(".")) for name in ELSEWHERE]
+    there = [at(stored, *name.split(".")) for name in ELSEWHERE]
+    if schema == CERTIFICATE_SCHEMA and here != there:
+        text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
+        found.append(Finding(file, "numbers", text, is_fault=False))
+        stored, new = _old_part(stored), _old_part(new)
+        del stored["nominal"], new["nominal"]
+    return found + [
+        Finding(file, text.split(" ")[0], text) for text in differences(stored, new)
+    ]
+
+
+def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:
+    """Verdict, and state and values of each criterion."""
+    nominal = certificate.get("nominal")
+    nominal = nominal if isinstance(nominal, dict) else {}
+    return {
+        "verdict": certificate.get("verdict"),
+        "nominal": {
+            name: {key: at(verdict, key) for key in ("state", "values")}
+            for name, verdict in nominal.items()
+        },
     }

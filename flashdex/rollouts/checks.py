@@ -21,7 +21,7 @@ from flashdex.metrics.criteria_table import resolve_criterion
 from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.build import grace_steps, link_names
 from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
-from flashdex.rollouts.findings import Finding, differences, short
+from flashdex.rollouts.findings import OLD, Finding, differences, short
 from flashdex.rollouts.models import compare_models, implausible, rebuild_around
 from flashdex.rollouts.resimulation import (
     Simulation,
@@ -36,7 +36,6 @@ from flashdex.system.machine import versions
 from flashdex.system.mjcf import compile_mjcf
 
 NO_LIBRARY = "its library is not at hand"
-OLD = "written by an older version, which did not bind it"
 SAME = 1e-6  # m, rad, m/s, rad/s; of numbers that one machine computes twice
 ALIKE = 1e-4  # of float32 numbers that another engine computed
 POINTS = 1e-5  # m; stored points come from float32 kinematics
@@ -178,11 +177,11 @@ class RolloutCheck:
             self.model = scene.model
             return
         # of a collection of several scenes, padded to the largest
-        self.model = compile_mjcf(r.model_xml, where=where)
-        scene = truth.scene(r.motion, nodes=self.model.nbvh)
+        stored = self.model = compile_mjcf(r.model_xml, where=where)
+        scene = truth.scene(r.motion, nodes=stored.nbvh)
         if r.model_xml != scene.xml:
             exact = self._versions.get("mujoco") == mujoco.__version__
-            self._compare(self.model, scene.model, exact=exact)
+            self._compare(stored, scene.model, exact=exact)
         bodies = load_simulation(r, scene.model).object_body
         for name, text in implausible(scene.model, bodies).items():
             self.skip(f"model {name}", f"{text}, by recipe and library themselves")

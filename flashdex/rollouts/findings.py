@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+OLD = "written by an older version, which did not bind it"
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -73,3 +75,10 @@ def short(value: Any) -> str:
     """A value in at most 60 characters."""
     text = value if isinstance(value, str) else json.dumps(value, default=str)
     return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+def at(value: Any, *names: str) -> Any:
+    """What lies under these keys of nested JSON objects, None where nothing does."""
+    for name in names:
+        value = value.get(name) if isinstance(value, dict) else None
+    return value

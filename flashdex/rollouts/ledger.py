@@ -32,13 +32,17 @@ LINE: dict[str, type | tuple[type, ...]] = {
     "env_steps": int,
     "wall_s": float,
 }
-# what newer versions, or only some lines, hold besides; null stands for nothing
-_MORE: dict[str, type] = {
-    **dict.fromkeys(("passed", "hands", "why", "trivial"), list),
-    **dict.fromkeys(("rollout", "verdict", "engine"), str),
-    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), str),
-    **dict.fromkeys(("certified", "completed"), bool),
-    **dict.fromkeys(("frame", "seed"), int),
+# what newer versions, or only some lines, hold besides
+_MORE: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("passed", "hands", "why", "trivial"), (list,)),
+    **dict.fromkeys(("frame", "seed"), (int,)),
+    **dict.fromkeys(("rollout", "verdict"), (str, type(None))),
+    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), (str, type(None))),
+    **dict.fromkeys(("lift_ratio", "path_ratio"), (float, int, type(None))),
+    "certified": (bool, type(None)),
+    "completed": (bool,),
+    "gpu_s": (float, int),
+    "engine": (str,),
 }
 
 
@@ -54,9 +58,9 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
         check_name(line["motion"], what="motion", where=where)
         if not math.isfinite(line["wall_s"]):
             raise RunError(f"{where} has {line['wall_s']} as 'wall_s'.")
-        for key, kind in _MORE.items():
+        for key, kinds in _MORE.items():
             value = line.get(key)
-            if value is not None and type(value) is not kind:
+            if key in line and type(value) not in kinds:
                 raise RunError(
                     f"{where} has {value!r:.60} as '{key}'. flashdex only adds lines "
                     "to this file; restore it from a copy."

@@ -15,9 +15,9 @@ from typing import Any
 
 from flashdex.errors import FlashdexError, RunError
 from flashdex.metrics.criteria import criterion_names, moves_too_little
-from flashdex.rollouts.certificate import CERTIFICATE_SCHEMA, PROVEN, certify
-from flashdex.rollouts.checks import OLD, RolloutCheck
-from flashdex.rollouts.findings import Finding, differences, short
+from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
+from flashdex.rollouts.checks import RolloutCheck
+from flashdex.rollouts.findings import OLD, Finding, at, differences
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
@@ -34,8 +34,6 @@ from flashdex.system.run_files import RECIPE, read_metrics, read_recipe, read_se
 
 CERTIFICATE = ".certificate.json"
 MAX_JSON = 16 << 20  # bytes of a certificate
-# of a certificate: where it was made, and what follows from a clock
-_ELSEWHERE = ("identity.certified_by", "provenance.certified_on")
 # of a line: what is counted from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
 RATIOS = ("lift_ratio", "path_ratio")
@@ -193,7 +191,7 @@ class _RunCheck:
         found: dict[tuple[str, str], list[str]] = {}
         for name, motions in rows.items():
             for motion in motions if isinstance(motions, dict) else ():
-                for criterion in _at(motions, motion, "passed") or ():
+                for criterion in at(motions, motion, "passed") or ():
                     found.setdefault((motion, criterion), []).append(name)
         return found
 
@@ -202,6 +200,8 @@ class _RunCheck:
         named = line.get("rollout")
         if named and named != rollout_name(line["motion"]):
             self.fault(where, f"names {named!a}, not the rollout of its motion")
+        if line.get("gpu_s", 0.0) not in (0.0, line["wall_s"]):
+            self.fault(where, f"gpu_s is {line['gpu_s']}, wall_s {line['wall_s']}")
         if line["converted"] != (line["criterion"] in line.get("passed", [])):
             self.fault(where, "converted is not what the passed criteria say")
         if self._baselines is not None and "trivial" in line:
@@ -244,8 +244,7 @@ class _RunCheck:
         if "reference_sha256" not in said:
             found.append(Finding(file, "hashes", OLD, is_fault=False))
         if "recipe_sha256" in said and (self.run_dir / RECIPE).exists():
-            recipe = read_recipe(self.run_dir)
-            sha = hashlib.sha256(recipe.encode()).hexdigest()
+            sha = self._recipe_sha256()
             if said["recipe_sha256"] != sha:
                 changed = self._was_overridden()
                 text = "recipe.yaml is another than it was made by"
@@ -267,8 +266,17 @@ class _RunCheck:
                 found.append(Finding(file, "motion", text))
         return found
 
+    def _recipe_sha256(self) -> str:
+        try:
+            recipe = read_recipe(self.run_dir)
+        except RunError:
+            return ""  # of no recipe
+        return hashlib.sha256(recipe.encode()).hexdigest()
+
     def _was_overridden(self) -> bool:
-        return any(session.get("overrides") for session in self._sessions())
+        """A later session than the first was given other values."""
+        starts = [x for x in self._sessions() if x.get("event") == "start"]
+        return any(session.get("overrides") for session in starts[1:])
 
     def _is_over(self) -> bool:
         """The last session ended in order, and so counted all its attempts."""
@@ -300,7 +308,7 @@ class _RunCheck:
         except (FlashdexError, ValueError) as error:
             return "not_measured", stored, [*found, Finding(name, "model", str(error))]
         if stored:
-            found += _compare_certificates(stored, new, name)
+            found += compare_certificates(stored, new, name)
         return new["verdict"], stored, found
 
     def _told(
@@ -345,47 +353,6 @@ class _RunCheck:
             for key, said, right in pairs
             for text in differences(said, right, at=key, tolerance=2e-6)
         ]
-
-
-def _compare_certificates(
-    stored: dict[str, Any], new: dict[str, Any], file: str
-) -> list[Finding]:
-    """Every number of a stored certificate that is not that of a new one."""
-    schema = _at(stored, "identity", "schema")
-    found: list[Finding] = []
-    if schema != CERTIFICATE_SCHEMA:
-        found.append(Finding(file, "hashes", OLD, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        new["nominal"] = {k: new["nominal"].get(k) for k in stored["nominal"]}
-    here = [_at(new, *name.split(".")) for name in _ELSEWHERE]
-    there = [_at(stored, *name.split(".")) for name in _ELSEWHERE]
-    if schema == CERTIFICATE_SCHEMA and here != there:
-        text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
-        found.append(Finding(file, "numbers", text, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        del stored["nominal"], new["nominal"]
-    return found + [
-        Finding(file, text.split(" ")[0], text) for text in differences(stored, new)
-    ]
-
-
-def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:
-    """Verdict, and state and values of each criterion."""
-    nominal = certificate.get("nominal")
-    nominal = nominal if isinstance(nominal, dict) else {}
-    return {
-        "verdict": certificate.get("verdict"),
-        "nominal": {
-            name: {key: _at(verdict, key) for key in ("state", "values")}
-            for name, verdict in nominal.items()
-        },
-    }
-
-
-def _at(value: Any, *names: str) -> Any:
-    for name in names:
-        value = value.get(name) if isinstance(value, dict) else None
-    return value
 
 
 def _read_json(file: Path) -> tuple[dict[str, Any], str]:

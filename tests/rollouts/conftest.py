@@ -22,3 +22,31 @@ def scene_xml():
 @pytest.fixture
 def oracle():
     return step_by_hand
+
+
+@pytest.fixture(scope="session")
+def proofs():
+    """Certificates by the content of the rollout; they are deterministic, see there."""
+    return {}
+
+
+@pytest.fixture
+def check(truth, proofs, monkeypatch):
+    """Faults of a run by what they name; the run must not hold."""
+    from flashdex.rollouts import verify
+    from flashdex.rollouts.certificate import certify
+
+    def remembered(rollout, *, model):
+        key = rollout.content_sha256
+        if key not in proofs:
+            proofs[key] = certify(rollout, model=model)
+        return proofs[key]
+
+    monkeypatch.setattr(verify, "certify", remembered)
+
+    def run(run_dir, *, library=True):
+        verified = verify.verify_run(run_dir, truth if library else None)
+        assert not verified.holds
+        return [str(f) for f in verified.findings if f.is_fault]
+
+    return run

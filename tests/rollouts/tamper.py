@@ -8,14 +8,18 @@ from dataclasses import fields
 import mujoco
 import numpy as np
 
+from flashdex.errors import RunError
 from flashdex.metrics.criteria_table import resolve_criterion
 from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.certificate import certify
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.verify import verify_file
 from flashdex.system.arrays import hash_content
 from flashdex.system.jsonl import read_lines, write_lines
 
+BOX = "rollouts/right_box.npz"
+PROOF = "rollouts/right_box.certificate.json"
 LONG = ("ctrl", "qpos", "qvel", "object_pos", "object_quat", "fingertips", "joints")
 LONG += tuple(f"ref_{n}" for n in ("object_pos", "object_quat", "fingertips", "joints"))
 LONG += ("actions", "wrench")
@@ -105,3 +109,26 @@ def replace_xml(data, old, new, *, count=1):
     text = str(data["model_xml"])
     assert old in text, old
     data["model_xml"] = np.asarray(text.replace(old, new, count))
+
+
+def alone(path):
+    """Faults of a file without its run."""
+    try:
+        return [str(f) for f in verify_file(path) if f.is_fault]
+    except RunError as error:
+        return [str(error)]
+
+
+def change(name, *, at=slice(None), by):
+    def run(data):
+        data[name] = data[name].copy()
+        data[name][at] += by
+
+    return run
+
+
+def put(name, value):
+    def run(data):
+        data[name] = np.asarray(value(data) if callable(value) else value)
+
+    return run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 
 
@@ -32,6 +33,23 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """
     close = difflib.get_close_matches(name, list(known), n=1)
     return f" Did you mean '{close[0]}'?" if close else ""
+
+
+# an OSError that the data cause: nothing there, or a name that no file can have
+_OF_THE_DATA = {
+    *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG),
+    *(errno.EINVAL, errno.EILSEQ, None),
+}
+
+
+def is_of_machine(error: BaseException) -> bool:
+    """Whether memory or a disk failed: nothing is said about the data.
+
+    The same call may go well the next time, so nobody turns it into a fault of the
+    data, and nobody keeps it.
+    """
+    is_disk = isinstance(error, OSError) and error.errno not in _OF_THE_DATA
+    return is_disk or isinstance(error, MemoryError)
 
 
 class UnknownNameError(FlashdexError):

@@ -24,6 +24,32 @@ def demos() -> Path:
 
 
 @pytest.fixture
+def write_keypoints(tmp_path):
+    """Write motions as a folder that the reader ``keypoints`` reads; return it.
+
+    Fields of the file replace those of the motion (None: not written).
+    """
+
+    def write(*demos, folder=tmp_path / "recordings", **fields):
+        (folder / "meshes").mkdir(parents=True, exist_ok=True)
+        for demo in demos:
+            for body in demo.objects:
+                body.load_mesh().export(folder / "meshes" / f"{body.name}.obj")
+            data = {
+                "fps": demo.fps,
+                "object": np.array([b.name for b in demo.objects]),
+                "obj_pose": np.stack([b.pose for b in demo.objects], axis=1),
+                **{f"kp_{side}": points for side, points in demo.keypoints.items()},
+                **{f"palm_{side}": pose for side, pose in demo.palm.items()},
+            }
+            data = {k: v for k, v in (data | fields).items() if v is not None}
+            np.savez(folder / f"{demo.name}.npz", **data)
+        return folder
+
+    return write
+
+
+@pytest.fixture
 def still_demo() -> HumanDemo:
     """A right hand and a box that both rest for one second at 30 fps."""
     points = np.repeat(hand_keypoints(GRASP)[None] + [0, 0, 0.2], 30, axis=0)

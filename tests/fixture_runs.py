@@ -25,6 +25,7 @@ TINY = {
     "future_latent": 8,
     "future_channels": [8, 8, 8],
 }
+CERTIFIED = {"certify": True, "render_conversions": False}
 
 
 @pytest.fixture
@@ -62,7 +63,7 @@ def roll_tiny(library, hands, bank):
     bench = RunBuilder(recipe, library, hands, bank)
 
     def roll(controller):
-        return roll_all(bench, controller)
+        return list(roll_all(bench, controller))
 
     return roll
 
@@ -94,19 +95,19 @@ def collect():
 def start_tiny(library):
     """Train for 60 vector steps of 6 worlds in a folder; return it.
 
-    Takes ``train`` and ``logger`` settings, and fields of Recipe.
+    Takes ``train`` and ``logger`` settings, motions to select, and fields of Recipe.
     """
     from flashdex.recipe import LoggerConfig, MotionsConfig, validate
     from flashdex.training.run_dir import train as start
 
-    def run(folder, *, train=None, logger=None, **fields):
+    def run(folder, *, train=None, logger=None, select=None, **fields):
         transforms = {**EnvConfig().transforms, "object_points": {"num_points": 4}}
         settings = {"log_every_s": 0.2, "certify": False, "torch_threads": 1}
         settings |= {"stop_when_all_converted": False}
         recipe = dataclasses.replace(
             Recipe(name="tiny", total_env_steps=360),
             run_dir=str(folder),
-            motions=MotionsConfig(library=str(library.path)),
+            motions=MotionsConfig(library=str(library.path), select=select),
             physics=PhysicsConfig(num_threads=1),
             env=EnvConfig(
                 num_envs=6,
@@ -122,6 +123,35 @@ def start_tiny(library):
         return start(validate(recipe))
 
     return run
+
+
+@pytest.fixture(scope="session")
+def converted_run(start_tiny, tmp_path_factory):
+    """A finished run of one motion, with a certificate."""
+    folder = tmp_path_factory.mktemp("converted") / "run"
+    return start_tiny(folder, train=CERTIFIED, select=["right_box"])
+
+
+@pytest.fixture(scope="session")
+def converted_pair(start_tiny, tmp_path_factory):
+    """A finished run of several motions, with certificates."""
+    return start_tiny(tmp_path_factory.mktemp("pair") / "run", train=CERTIFIED)
+
+
+@pytest.fixture(scope="session")
+def truth(converted_run):
+    """Recipe and library of the converted run."""
+    from flashdex.training.loaded import open_truth
+
+    found, why = open_truth(converted_run)
+    assert found is not None, why
+    return found
+
+
+@pytest.fixture
+def spoilt_run(converted_run, tmp_path):
+    """A copy of the converted run, for a test to tamper with."""
+    return Path(shutil.copytree(converted_run, tmp_path / "run"))
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,9 @@ both. The fingers close on the objects, so that there are contacts from early on
 
 from __future__ import annotations
 
+import contextlib
+import json
+
 import numpy as np
 import torch
 import trimesh
@@ -13,8 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_check import hash_rows
+from flashdex.motions.library_format import read_manifest
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
 from flashdex.objects.asset import ObjectAsset
+from flashdex.system.arrays import hash_content, write_array
 
 FPS = 60.0
 HALF = np.array([0.025, 0.03, 0.02])  # m, half extents of the box
@@ -25,9 +31,12 @@ HINGES = np.array([[-0.4, 1.19, -0.13], [2.98, -1.19, 0.01]])
 FINGERS = np.array([1.4, 0.5, 0.4, 0.1, 0.8, 0.6, 0.9, 0.6, 0.9, 0.6, 0.7, 1.0])
 
 
-def write_library(path, hands):
-    """Write three motions of 40, 31 and 52 frames and open the library."""
-    writer = LibraryWriter(path, hand="xhand", fps=FPS)
+def write_library(path, hands, *, changes=None, manifest=None):
+    """Write three motions of 40, 31 and 52 frames and open the library.
+
+    ``changes`` holds functions by name of the motion; each changes its MotionRecord.
+    """
+    writer = LibraryWriter(path, hand="xhand", fps=FPS, manifest=manifest)
     box, ball = make_box(), make_ball()
     plans = {
         "right_box": ((False, True), (-1, 0), [box]),
@@ -38,8 +47,11 @@ def write_library(path, hands):
     disks[0] = [0.0, 0.0, 0.0, 0.8, 0.02]
     for name, (active, owner, objects) in plans.items():
         frames = make_frames(hands, LENGTHS[name], active, owner, objects)
-        writer.add(MotionRecord(name, frames, active, owner, objects, disks))
-    return MotionLibrary.load(writer.write())
+        record = MotionRecord(name, frames, active, owner, objects, disks)
+        for change in (changes or {}).get(name, ()):
+            change(record)
+        writer.add(record)
+    return MotionLibrary.load(writer.write(report="motion\n"))
 
 
 def make_frames(hands, length, active, owner, objects):
@@ -170,3 +182,38 @@ def make_asset(name, mesh, points, distance, mass, com, inertia):
         visual_vertices=np.float32(mesh.vertices),
         visual_faces=np.asarray(mesh.faces, np.int32),
     )
+
+
+def forge_library(path, edit):
+    """Change a library as somebody who knows the format: all hashes fit again.
+
+    ``edit`` gets the manifest's entries and the arrays by name and changes them.
+    """
+    entries = json.loads((path / "manifest.json").read_text())
+    data = path / entries["data"]
+    arrays = {name: np.load(data / f"{name}.npy") for name in entries["arrays"]}
+    edit(entries, arrays)
+    for name, array in arrays.items():
+        (data / f"{name}.npy").unlink(missing_ok=True)
+        entries["arrays"][name] = write_array(data / f"{name}.npy", array).to_dict()
+    for file in entries["meshes"]:
+        if (data / file).is_file():
+            entries["meshes"][file] = hash_content(data / file)
+    with contextlib.suppress(Exception):  # of what is no library any more
+        hashes = hash_rows(entries, arrays, entries["meshes"])
+        for part, found in zip(("motions", "objects"), hashes, strict=True):
+            for row, digest in zip(entries[part], found, strict=True):
+                row["content_sha256"] = digest
+    (path / "manifest.json").write_text(json.dumps(entries))
+
+
+def data_of(path):
+    """Folder of the arrays and meshes of a library."""
+    return path / read_manifest(path).data
+
+
+def edit_manifest(path, edit):
+    """Change entries of a manifest; no hash fits any more."""
+    entries = json.loads((path / "manifest.json").read_text())
+    edit(entries)
+    (path / "manifest.json").write_text(json.dumps(entries))

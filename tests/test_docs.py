@@ -131,7 +131,8 @@ def test_run_page_names_exactly_the_keys_of_an_attempt(tiny_run):
     lines = read_lines(tiny_run / "conversions.jsonl")
     assert lines
     keys = {key for line in lines for key in line}
-    stored = {"rollout", "verdict"}  # of conversions only
+    # of conversions only
+    stored = {"rollout", "verdict", "rollout_sha256", "certificate_sha256"}
     assert keys | stored == first_cells("runs.md", "conversions.jsonl")
 
 
@@ -167,7 +168,7 @@ def test_criteria_page_names_exactly_the_criteria():
 
 
 def test_data_page_names_exactly_the_frame_entries():
-    from flashdex.motions.library import FRAME_KEYS
+    from flashdex.motions.library_format import FRAME_KEYS
 
     assert set(FRAME_KEYS) == first_cells("data.md", "frames")
 
@@ -184,7 +185,7 @@ def test_data_page_names_exactly_the_codes_of_a_report():
 
 
 def test_data_page_names_exactly_the_quality_entries():
-    from flashdex.motions.library import QUALITY_KEYS
+    from flashdex.motions.library_format import QUALITY_KEYS
 
     assert set(QUALITY_KEYS) == first_cells("data.md", "quality")
 

@@ -244,27 +244,36 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     from flashdex.recipe import require_motions
-    from flashdex.reports.run.terminal import replay_line
-    from flashdex.rollouts.replay import replay
+    from flashdex.reports.run.terminal import finding_lines, replay_line
+    from flashdex.rollouts.verify import verify_run
+    from flashdex.training.loaded import open_truth
 
     require_motions(args.run_dir)
-    replayed = replay(args.run_dir)
-    for one in replayed:
+    truth, why = open_truth(args.run_dir)
+    verified = verify_run(args.run_dir, truth)
+    for one in verified.rollouts:
         print(replay_line(one.motion, one.stored, one.found, holds=one.holds))
-    return 0 if all(one.holds for one in replayed) else 1
+    for line in finding_lines(verified.findings, why):
+        print(line)
+    return 0 if verified.holds else 1
 
 
 def _score(args: argparse.Namespace) -> int:
-    from flashdex.reports.run.terminal import score_table
+    from flashdex.reports.run.terminal import finding_lines, score_table
     from flashdex.rollouts.rollout import Rollout
+    from flashdex.rollouts.verify import faults, verify_file
 
     found = {str(path): Rollout.load(path).score() for path in args.files}
+    findings = {str(path): verify_file(path) for path in args.files}
     if args.json:
         plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
         print(json.dumps(plain, indent=1))
     else:
         print("\n\n".join(score_table(f, s) for f, s in found.items()))
-    return 0
+    every = [finding for some in findings.values() for finding in some]
+    for line in finding_lines(every):
+        print(line, file=sys.stderr if args.json else sys.stdout)
+    return 1 if faults(every) else 0
 
 
 def _report(args: argparse.Namespace) -> int:

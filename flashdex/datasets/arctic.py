@@ -22,7 +22,14 @@ from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import MAX_SECONDS, DemoObject, HumanDemo
 from flashdex.datasets.fields import part, pose_track, same_length, to_array, track
 from flashdex.datasets.files import load_npy, read_json, refuse_clone, told
-from flashdex.datasets.roots import relative, require_folders, require_mesh, scaled_mesh
+from flashdex.datasets.roots import (
+    listed,
+    on_disk,
+    relative,
+    require_folders,
+    require_mesh,
+    scaled_mesh,
+)
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import missing_frames
 from flashdex.errors import DemoError
@@ -54,11 +61,11 @@ class ArcticSequence:
 
     def file(self, kind: str) -> Path:
         """``<name>.<kind>.npy``; kinds are mano and object."""
-        return self.root / SEQUENCES / f"{self.name}.{kind}.npy"
+        return on_disk(self.root / SEQUENCES / f"{self.name}.{kind}.npy")
 
     def files(self) -> list[Path]:
         """Every file of the dataset that it depends on and that exists."""
-        meshes = [self.meshes / f"{part}.obj" for part in PARTS]
+        meshes = [on_disk(self.meshes / f"{part}.obj") for part in PARTS]
         files = [self.file("mano"), self.file("object"), *meshes]
         return [file for file in files if file.is_file()]
 
@@ -71,8 +78,8 @@ def list_arctic(options: SourceOptions) -> list[Recording]:
     models = mano_pair(mano)
     splits = _read_splits(options.splits or root / SPLIT_LIST, given=options.splits)
     recordings = []
-    for file in sorted((root / SEQUENCES).glob("*/*.mano.npy")):
-        name = f"{file.parent.name}/{file.name.removesuffix('.mano.npy')}"
+    for file in listed(root / SEQUENCES, "*/*.mano.npy"):
+        name = f"{file.parent.name}/{file.name[: -len('.mano.npy')]}"
         sequence = ArcticSequence(
             root=root,
             name=name,
@@ -154,8 +161,8 @@ def _read_objects(sequence: ArcticSequence) -> list[DemoObject]:
     opened = turns * Rotation.from_rotvec(stored[seen, :1] * HINGE)
     bodies = []
     for name, turn in zip(PARTS, (opened, turns), strict=True):
-        mesh = sequence.meshes / f"{name}.obj"
-        require_mesh(mesh, "Unpack meta.zip, or name the folder of object_vtemplates")
+        hint = "Unpack meta.zip, or name the folder of object_vtemplates"
+        mesh = require_mesh(sequence.meshes / f"{name}.obj", hint)
         body = scaled_mesh(mesh, MILLIMETRE)
         pose = pose_track(turn, place, seen)
         bodies.append(DemoObject(f"{sequence.words[0]}_{name}", body, pose))

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from flashdex.datasets.tracks import palm_frame
+from flashdex.datasets.roots import refuse_odd_name
+from flashdex.datasets.tracks import blank_fillers, palm_frame
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
 from flashdex.objects.meshes import load_mesh
@@ -29,6 +30,10 @@ class DemoObject:
     mesh: Path | trimesh.Trimesh  # or its file; metres, in the frame of ``pose``
     pose: np.ndarray  # position (m) and quaternion (wxyz) in the world, (T, 7)
 
+    def __post_init__(self) -> None:
+        """Blank what was not tracked, see ``blank_fillers``."""
+        self.pose = blank_fillers(self.pose)
+
     def load_mesh(self) -> trimesh.Trimesh:
         """The mesh, read from its file if it is given as one; not cleaned."""
         if isinstance(self.mesh, trimesh.Trimesh):
@@ -40,7 +45,8 @@ class DemoObject:
 class HumanDemo:
     """One recorded human motion, before any processing; numpy float64.
 
-    A frame in which a hand or an object was not tracked holds NaN in all its tracks.
+    A frame in which a hand or an object was not tracked holds NaN in all its tracks;
+    the marks that data sets write there (zeros, -1) become NaN here.
     ``flashdex.motions.repair`` closes short gaps and cuts at long ones before a motion
     is validated.
     """
@@ -67,7 +73,9 @@ class HumanDemo:
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Fill in the palms; where keypoints have a wrong shape, validation tells."""
+        """Blank what was not tracked, fill in the palms; validation tells the rest."""
+        self.keypoints = {s: blank_fillers(p) for s, p in self.keypoints.items()}
+        self.palm = {s: blank_fillers(p) for s, p in self.palm.items()}
         for side, points in self.keypoints.items():
             if side not in self.palm and points.shape[1:] == (21, 3):
                 self.palm[side] = palm_frame(points, side)
@@ -88,6 +96,9 @@ class HumanDemo:
         With ``complete`` every frame must be tracked, and there must be enough of them;
         before repair, only what repair cannot mend counts.
         """
+        refuse_odd_name(self.name, what="motion")
+        for body in self.objects:
+            refuse_odd_name(body.name, what="object", where=self.name)
         if not self.keypoints:
             raise DemoError(
                 f"{self.name}: no hand. Give keypoints for 'left', 'right'."

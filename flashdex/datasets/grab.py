@@ -22,7 +22,13 @@ from flashdex.datasets.body_models.mano import NUM_VERTICES, load_mano, mano_pai
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import number, part, pose_track, same_length, track, word
 from flashdex.datasets.files import load_npz, refuse_clone
-from flashdex.datasets.roots import relative, require_folders, require_mesh
+from flashdex.datasets.roots import (
+    listed,
+    on_disk,
+    relative,
+    require_folders,
+    require_mesh,
+)
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.tracks import missing_frames, rotation
 from flashdex.errors import DemoError, MeshError
@@ -70,16 +76,16 @@ class GrabSequence:
         own = Path(stored.replace("\\", "/"))
         if own.is_absolute() or ".." in own.parts:
             raise DemoError(f"{self.file}: mesh '{stored}' is not inside the dataset.")
-        apart = self.models / own.name if self.models else None
-        return apart if apart and apart.is_file() else self.root / own
+        apart = on_disk(self.models / own.name) if self.models else None
+        return apart if apart and apart.is_file() else on_disk(self.root / own)
 
     def files(self) -> list[Path]:
         """Every file that it depends on and that exists."""
         folders = [self.root / TOOLS / MESHES, *([self.models] if self.models else [])]
         names = (f"{self.object}.ply", "table.ply")
-        meshes = [folder / name for folder in folders for name in names]
+        meshes = [on_disk(folder / name) for folder in folders for name in names]
         people = self.root / TOOLS / "subject_meshes"
-        hands = sorted(people.glob(f"*/{self.file.parent.name}_[lr]hand.ply"))
+        hands = listed(people, f"*/{self.file.parent.name}_[lr]hand.ply")
         return [file for file in (self.file, *meshes, *hands) if file.is_file()]
 
 
@@ -88,7 +94,7 @@ def list_grab(options: SourceOptions) -> list[Recording]:
     root, mano = options.folder("path"), options.folder("mano")
     require_folders(root, (SEQUENCES, TOOLS), dataset="GRAB")
     models = mano_pair(mano)
-    files = sorted((root / SEQUENCES).glob("s*/*.npz"))
+    files = listed(root / SEQUENCES, "s*/*.npz")
     if not files:
         raise DemoError(
             f"{root / SEQUENCES}: no s1 ... s10/<object>_<action>_<take>.npz. "

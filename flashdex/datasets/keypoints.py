@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from flashdex.datasets.demo import DemoObject, HumanDemo
-from flashdex.datasets.fields import number, numbers
+from flashdex.datasets.fields import number, numbers, words
 from flashdex.datasets.files import load_npz, read_json, told
+from flashdex.datasets.roots import listed, on_disk, refuse_odd_name
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.support import demo_support
 from flashdex.errors import DemoError, MeshError
@@ -32,14 +33,14 @@ REQUIRED = ("fps", "object", "obj_pose")
 def list_keypoints(options: SourceOptions) -> list[Recording]:
     """Recordings of a folder or one file, in name order."""
     path = options.folder("path")
-    files = [path] if path.is_file() else sorted(path.glob("*.npz"))
+    files = [path] if path.is_file() else listed(path, "*.npz")
     if not files:
         raise DemoError(
             f"{path}: no .npz recordings. Expected a folder with <clip>.npz files and "
             f"meshes/<object>.obj, or one such file."
         )
     segments = _read_segments(files[0].parent)
-    lists = tuple(sorted(files[0].parent.glob("segments*.json")))
+    lists = tuple(listed(files[0].parent, "segments*.json"))
     return [
         Recording(
             name=file.stem,
@@ -95,7 +96,7 @@ def read_file(file: Path) -> HumanDemo:
 
 def _read_objects(file: Path, data: dict) -> list[DemoObject]:
     """One object with ``obj_pose`` (T, 7), or several with (T, N, 7)."""
-    names = [str(name) for name in np.atleast_1d(data["object"])]
+    names = words(data["object"])
     poses = numbers(data["obj_pose"], what=f"{file}: obj_pose")
     if poses.ndim == 2:
         poses = poses[:, None]
@@ -111,16 +112,15 @@ def _read_objects(file: Path, data: dict) -> list[DemoObject]:
 
 
 def _mesh_file(file: Path, name: str) -> Path:
-    if name != Path(name).name:
-        raise DemoError(f"{file}: object '{name}' must be a plain name, not a path.")
-    return file.parent / "meshes" / f"{name}.obj"
+    refuse_odd_name(name, what="object", where=file)
+    return on_disk(file.parent / "meshes" / f"{name}.obj")
 
 
 def _mesh_files(file: Path) -> tuple[Path, ...]:
     """Meshes that a recording names; none where it cannot be read (yet)."""
     try:
-        names = np.atleast_1d(load_npz(file, only=["object"], plain=True)["object"])
-        meshes = [_mesh_file(file, str(name)) for name in names]
+        names = words(load_npz(file, only=["object"], plain=True)["object"])
+        meshes = [_mesh_file(file, name) for name in names]
         return tuple(mesh for mesh in meshes if mesh.is_file())
     except (OSError, KeyError, DemoError):
         return ()
@@ -128,7 +128,7 @@ def _mesh_files(file: Path) -> tuple[Path, ...]:
 
 def _read_segments(folder: Path) -> dict[str, list[tuple[int, int]]]:
     pieces: dict[str, list[tuple[int, int]]] = {}
-    for file in sorted(folder.glob("segments*.json")):
+    for file in listed(folder, "segments*.json"):
         fault = "not a list of {clip, start, end}"
         with told(file, fault):
             for row in read_json(file, fault):

@@ -20,7 +20,8 @@ import numpy as np
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fetch import NOTE, myodm_dir
 from flashdex.datasets.fields import require
-from flashdex.datasets.files import load_npz, read_json
+from flashdex.datasets.files import load_npz, read_bytes, read_json, told
+from flashdex.datasets.roots import listed, on_disk
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 
@@ -71,14 +72,17 @@ def myohand_keypoints(tree: Path, joint_pos: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _model(tree: Path) -> tuple[mujoco.MjModel, tuple[tuple[bool, int], ...]]:
-    import mujoco
+    # here: sources are listed without MuJoCo
+    from flashdex.system.mjcf import ModelError, compile_mjcf
 
     text = _read(tree)
     try:
         root = ET.fromstring(text)
-        model = mujoco.MjModel.from_xml_string(_plain_xml(root))
+        model = compile_mjcf(_plain_xml(root), where=str(tree))
         owners = tuple(_owner(model, name) for name in ELEMENTS)
-    except (ET.ParseError, ValueError, KeyError) as error:
+    except ModelError as error:
+        raise DemoError(error.text, code="E_FILE") from error
+    except (ET.ParseError, ValueError, KeyError, RecursionError) as error:
         raise DemoError(f"{tree}: not the MyoHand tree ({error}).") from error
     if model.nq != NUM_JOINTS:
         raise DemoError(f"{tree}: {model.nq} joints, expected {NUM_JOINTS}.")
@@ -86,12 +90,10 @@ def _model(tree: Path) -> tuple[mujoco.MjModel, tuple[tuple[bool, int], ...]]:
 
 
 def _read(tree: Path) -> str:
-    try:
-        data = tree.read_bytes()
-    except OSError as error:
-        raise DemoError(f"{tree}: cannot be read ({error}).") from error
-    if len(data) > MAX_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise DemoError(f"{tree}: not the MyoHand tree (too large, or a DOCTYPE).")
+    with told(tree, "not the MyoHand tree"):
+        data = read_bytes(tree, most=MAX_BYTES)
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise DemoError(f"{tree}: not the MyoHand tree (a DOCTYPE).")
     return data.decode("utf-8", errors="replace")
 
 
@@ -152,7 +154,7 @@ def list_myodm(options: SourceOptions) -> list[Recording]:
     """Clips of the fetched folder, in name order."""
     root = options.path or myodm_dir()
     hand = root / "myohand_body.xml"
-    clips = sorted((root / "clips").glob("*.npz"))
+    clips = listed(root / "clips", "*.npz")
     if not clips or not hand.is_file():
         raise DemoError(
             f"{root}: no MyoDM recordings (clips/*.npz and myohand_body.xml). "
@@ -225,7 +227,7 @@ def _object_name(file: Path) -> str:
 
 
 def _mesh_file(clip: Path) -> Path:
-    return clip.parent.parent / "meshes" / f"{_object_name(clip)}.stl"
+    return on_disk(clip.parent.parent / "meshes" / f"{_object_name(clip)}.stl")
 
 
 def _origin(root: Path) -> dict[str, str]:

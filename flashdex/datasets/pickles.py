@@ -4,7 +4,7 @@ Licensed datasets come as pickles, object arrays and torch files (see ``files``)
 pickle may name stands in ``ALLOWED``; every other name is refused and told. What it
 names is a stand-in that only keeps what it is given; plain values are made of it
 afterwards, from checked sizes and indices. So no name can be called to an effect, and
-no class of a library is within reach. Nothing becomes more than 4 GiB.
+no class of a library is within reach. Nothing becomes more than 2 GiB.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
-MAX_BYTES = 4 << 30  # of what a file becomes; more is a mistake or an attack
+MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
+MAX_PARTS = 50_000_000  # of the containers of a file
+
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
 # what an old torch file begins with, its version, and the storages it may hold
 MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001
@@ -199,7 +201,7 @@ def _tensor(args: tuple, state: Any) -> Any:
     if count and last >= flat.numel():
         raise ValueError(f"a tensor of shape {sizes} that leaves its storage")
     if count * flat.element_size() > MAX_BYTES:
-        raise ValueError(f"a tensor of shape {sizes} becomes more than 4 GiB")
+        raise ValueError(f"a tensor of shape {sizes} becomes more than 2 GiB")
     return flat.as_strided(sizes, strides, offset if count else 0).clone()
 
 
@@ -294,6 +296,9 @@ def unpickle(file: IO[bytes]) -> Any:
     """
     tree = _load(file)
     done: dict[int, Any] = {}
+    # parts of each container, shared ones as often as they are met: lists of the same
+    # lists make billions of a few bytes for whoever goes over them
+    parts: dict[int, int] = {}
     size = 0
 
     def plain(item: Any) -> Any:
@@ -308,7 +313,12 @@ def unpickle(file: IO[bytes]) -> Any:
             length = len(made) if isinstance(made, (*CONTAINERS, dict)) else 0
             size += getattr(made, "nbytes", 0) or 8 * length
             if size > MAX_BYTES:
-                raise ValueError("it becomes more than 4 GiB")
+                raise ValueError("it becomes more than 2 GiB")
+            if length:
+                inner = made.values() if isinstance(made, dict) else made
+                parts[id(made)] = length + sum(parts.get(id(i), 0) for i in inner)
+                if parts[id(made)] > MAX_PARTS:
+                    raise ValueError(f"it has more than {MAX_PARTS} parts")
         if done[key] is BUSY:
             raise ValueError("a part that contains itself")
         return done[key]

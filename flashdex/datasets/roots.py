@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import trimesh
 
-from flashdex.errors import DemoError, MeshError
+from flashdex.errors import DemoError, FlashdexError, MeshError
 from flashdex.objects.meshes import load_mesh
+from flashdex.system.names import check_name
 
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".7z")
+MAX_LEVELS = 32  # of folders below a root
 NUM_SHOWN = 8  # entries of a folder that a message shows
 SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 FAVOURITES = ("visual", "mesh")  # what exporters call the one mesh to look at
@@ -26,6 +30,60 @@ def require_folders(root: Path, folders: Sequence[str], *, dataset: str) -> None
             f"found: {shown(root)}.{_hint(root, folders)}",
             code="E_ROOT",
         )
+
+
+def listed(folder: Path, pattern: str) -> list[Path]:
+    """Entries below a folder, by a pattern such as ``s*/*.npz``; sorted by path.
+
+    As folders are found on disks: links are followed, case does not matter, and what is
+    hidden (twins ``._x`` of macOS, what is half downloaded) is left out. Nothing where
+    there is no such folder.
+    """
+    head, _, rest = pattern.partition("/")
+    if not folder.is_dir():
+        return []
+    found = [
+        folder / entry.name
+        for entry in os.scandir(folder)
+        if not entry.name.startswith(".")
+        and fnmatchcase(entry.name.casefold(), head.casefold())
+    ]
+    if rest:
+        found = [below for entry in found for below in listed(entry, rest)]
+    return sorted(found)
+
+
+def listed_below(folder: Path, name: str) -> list[Path]:
+    """Files of a name in a folder and everywhere below it, as ``listed``.
+
+    Raises:
+        DemoError: links lead round in a circle, or far too deep.
+    """
+    found, level, seen = [], [folder], set()
+    for _ in range(MAX_LEVELS):
+        deeper = []
+        for place in level:
+            real = os.path.realpath(place)
+            if real in seen:
+                continue
+            seen.add(real)
+            found += [f for f in listed(place, name) if not f.is_dir()]
+            deeper += [entry for entry in listed(place, "*") if entry.is_dir()]
+        level = deeper
+    if level:
+        text = f"{folder}: more than {MAX_LEVELS} levels of folders. Give the root."
+        raise DemoError(text, code="E_ROOT")
+    return sorted(found)
+
+
+def on_disk(file: Path) -> Path:
+    """A file as it is called on the disk, where only the case of its name differs."""
+    if file.exists():
+        return file
+    same = [
+        f for f in listed(file.parent, "*") if f.name.casefold() == file.name.casefold()
+    ]
+    return same[0] if len(same) == 1 else file
 
 
 def relative(file: Path, root: Path) -> str:
@@ -50,13 +108,21 @@ def _hint(root: Path, folders: Sequence[str]) -> str:
     if not root.is_dir():
         return ""
     above = root.resolve().parents[:3]
-    inside = sorted(entry for entry in root.iterdir() if entry.is_dir())
+    inside = [entry for entry in listed(root, "*") if entry.is_dir()]
     for place, where in [(above, "inside"), (inside, "above")]:
         for folder in place:
             if all((folder / name).is_dir() for name in folders):
                 return f" It lies {where} the root: give {folder}."
     packed = [e.name for e in sorted(root.iterdir()) if e.suffix in ARCHIVES]
     return f" Unpack {', '.join(packed[:NUM_SHOWN])}." if packed else ""
+
+
+def refuse_odd_name(name: str, *, what: str, where: Path | str = "") -> None:
+    """A ``DemoError`` where a name out of a file is none, see ``check_name``."""
+    try:
+        check_name(name, what=what, where=str(where))
+    except FlashdexError as error:
+        raise DemoError(error.text, code="E_KEYS") from error
 
 
 def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
@@ -67,12 +133,10 @@ def seek_mesh(name: str, folders: Iterable[Path]) -> Path | None:
     in ``<name>/``. A ``DemoError`` where the id is a path, or several meshes stand in
     its folder and none of these names.
     """
-    if not name or name in (".", "..") or name != Path(name).name or "\\" in name:
-        text = f"Object id '{name}' must be a plain name, not a path."
-        raise DemoError(text, code="E_KEYS")
+    refuse_odd_name(name, what="object")
     for folder in folders:
         for suffix in SUFFIXES:
-            if (file := folder / f"{name}{suffix}").is_file():
+            if (file := on_disk(folder / f"{name}{suffix}")).is_file():
                 return file
         if (found := mesh_in(folder / name)) is not None:
             return found
@@ -98,10 +162,10 @@ def mesh_in(folder: Path) -> Path | None:
     """The mesh in an object's own folder, or None; several need a telling name."""
     if not folder.is_dir():
         return None
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES)
+    files = [f for f in listed(folder, "*") if f.suffix.lower() in SUFFIXES]
     for stem in (*FAVOURITES, folder.name):
         for file in files:
-            if file.stem == stem:
+            if file.stem.casefold() == stem.casefold():
                 return file
     if len(files) > 1:
         names = ", ".join(f.name for f in files[:4])
@@ -115,6 +179,7 @@ def mesh_in(folder: Path) -> Path | None:
 
 def require_mesh(file: Path, hint: str) -> Path:
     """Refuse a mesh that is missing; the hint says what to do, with --models."""
+    file = on_disk(file)
     if not file.is_file():
         raise DemoError(f"{file}: mesh not found. {hint} with --models.", code="E_FILE")
     return file

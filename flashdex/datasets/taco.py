@@ -24,11 +24,19 @@ import numpy as np
 from flashdex.datasets.body_models.mano import load_mano, mano_pair
 from flashdex.datasets.demo import DemoObject, HumanDemo
 from flashdex.datasets.fields import numbers, part, poses_from_matrices, row, to_array
-from flashdex.datasets.files import load_pickle, refuse_clone, refuse_pointer, told
-from flashdex.datasets.roots import relative, require_folders, scaled_mesh
+from flashdex.datasets.files import (
+    load_pickle,
+    read_bytes,
+    read_text,
+    refuse_clone,
+    refuse_pointer,
+    told,
+)
+from flashdex.datasets.roots import listed, relative, require_folders, scaled_mesh
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES, Side
+from flashdex.system.archives import read_array
 
 NUM_POSE, NUM_BETAS = 48, 10
 FRAME = {"hand_pose": NUM_POSE, "hand_trans": 3}  # axis-angle, rad; wrist position, m
@@ -59,7 +67,7 @@ class TacoSequence:
         """One file of all frames, or one a frame in an older layout; in time order."""
         folder = self.root / HANDS / self.folder
         whole = folder / f"{side}_hand.pkl"
-        each = sorted((folder / f"{side}_hand").glob("hand_*.pkl"))
+        each = listed(folder / f"{side}_hand", "hand_*.pkl")
         return [whole] if whole.is_file() else each
 
     def shape_file(self, side: Side) -> Path:
@@ -68,7 +76,7 @@ class TacoSequence:
 
     def pose_files(self, role: str) -> list[Path]:
         """``<role>_<id>.npy``; one is expected."""
-        return sorted((self.root / OBJECTS / self.folder).glob(f"{role}_*.npy"))
+        return listed(self.root / OBJECTS / self.folder, f"{role}_*.npy")
 
     def files(self) -> list[Path]:
         """Every file of the dataset that the sequence depends on and that exists."""
@@ -187,7 +195,7 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
 def _load_matrices(file: Path) -> np.ndarray:
     fault = "not a .npy of (T, 4, 4) floats; pickled arrays are not read"
     with told(file, fault, code="E_KEYS"):
-        return numbers(np.load(file, allow_pickle=False), what=f"{file}: (T, 4, 4)")
+        return numbers(read_array(read_bytes(file)), what=f"{file}: (T, 4, 4)")
 
 
 def _common_length(
@@ -263,8 +271,8 @@ def _find_meshes(root: Path, extra: Path | None) -> dict[str, Path]:
     places = places if extra is None else [extra, *places]
     found: dict[str, Path] = {}
     for place in places:
-        for file in sorted(place.glob(f"*{MESH_SUFFIX}")):
-            found.setdefault(file.name.removesuffix(MESH_SUFFIX), file)
+        for file in listed(place, f"*{MESH_SUFFIX}"):
+            found.setdefault(file.name[: -len(MESH_SUFFIX)], file)
     if not found:
         sought = ", ".join(str(place) for place in places)
         raise DemoError(
@@ -278,14 +286,14 @@ def _find_meshes(root: Path, extra: Path | None) -> dict[str, Path]:
 def _folders(root: Path) -> list[str]:
     """``(verb, tool, target)/<sequence>`` of all sequences below a folder."""
     found = []
-    for triplet in sorted(entry for entry in root.iterdir() if entry.is_dir()):
+    for triplet in (entry for entry in listed(root, "*") if entry.is_dir()):
         if not TRIPLET.fullmatch(triplet.name):
             logger.warning("%s: not '(verb, tool, target)'; left out", triplet)
             continue
         found += [
             f"{triplet.name}/{entry.name}"
-            for entry in triplet.iterdir()
-            if entry.is_dir() and not entry.name.startswith(".")
+            for entry in listed(triplet, "*")
+            if entry.is_dir()
         ]
     return found
 
@@ -303,7 +311,7 @@ def _unique_names(folders: list[str]) -> list[str]:
 
 def _read_splits(file: Path, folders: list[str]) -> dict[str, str]:
     with told(file, "not a readable list of splits"):
-        lines = file.read_text(encoding="utf-8").split()
+        lines = read_text(file).split()
     matches = [SPLIT_LINE.fullmatch(line) for line in lines]
     splits = {match[1]: match[2] for match in matches if match}
     known = {Path(folder).name for folder in folders}

@@ -11,6 +11,7 @@ from flashdex.keys import Side
 VELOCITY_SIGMA = 2.0  # frames, of the Gaussian over velocities (method.md 14)
 # m; a number beyond is no position, and its square may not be a number at all
 FARTHEST = 1e6
+MARK_SPREAD = 1e-6  # of the entries of a frame; below, they are all the same
 
 
 def rotation(quat: np.ndarray) -> Rotation:
@@ -123,6 +124,26 @@ def missing_frames(*tracks: np.ndarray) -> np.ndarray:
     """Frames in which any value of tracks (T, ...) is NaN or infinite, (T,) bool."""
     sound = [np.isfinite(t).all(axis=tuple(range(1, t.ndim))) for t in tracks]
     return ~np.logical_and.reduce(sound)
+
+
+def blank_fillers(track: np.ndarray) -> np.ndarray:
+    """A track with NaN in frames that hold a mark in place of numbers.
+
+    Data sets write zeros, or -1, or another number, where nothing was tracked: a frame
+    of poses (T, 7), transforms (T, 4, 4) or keypoints (T, 21, 3) whose entries are all
+    the same, or whose quaternion is zero. Tracks of other shapes stay as they are.
+    """
+    if track.ndim == 3 and track.size:
+        spread = np.ptp(track, axis=(1, 2))
+    elif track.ndim == 2 and track.shape[1] == 7 and len(track):
+        no_turn = np.abs(track[:, 3:]).max(axis=1)
+        spread = np.minimum(np.ptp(track, axis=1), no_turn)
+    else:
+        return track
+    marked = spread < MARK_SPREAD  # NaN compares as False
+    if not marked.any():
+        return track
+    return np.where(marked.reshape(-1, *[1] * (track.ndim - 1)), np.nan, track)
 
 
 def short_gaps(missing: np.ndarray, fps: float) -> list[tuple[int, int]]:

@@ -45,7 +45,7 @@ class ReferenceBank(nn.Module):
         super().__init__()
         # Columns of the packed table and the shape they are read back with.
         self._fields: dict[str, tuple[slice, tuple[int, ...]]] = {}
-        frames, motions = library.frames, _plain(library.motions)
+        frames, motions = library.frames, library.motions
         start = motions["start"].long()
         length = motions["length"].long()
         active = motions["hand_active"].bool()
@@ -65,7 +65,7 @@ class ReferenceBank(nn.Module):
         self.register_buffer("object_index", rows)
         own = torch.gather(rows, 1, slot.clamp_min(0)).clamp_min(0)
         self.register_buffer("hand_object", own)
-        objects = _plain(library.objects)
+        objects = library.objects
         for name in ("points", "radius", "mass", "inertia", "com"):
             self.register_buffer(name, objects[name].float())
         self.sdf = SdfGrid(
@@ -185,11 +185,6 @@ def stack_hands(hands: dict[keys.Side, HandSpec], name: str) -> Tensor:
     """Numbers of both hands' specs, left first, (2, ...)."""
     values = [torch.as_tensor(getattr(hands[side], name)) for side in keys.SIDES]
     return torch.stack(values).float()
-
-
-def _plain(mapped: TensorDict) -> dict[str, Tensor]:
-    """The same memory as ordinary tensors, whose indexing costs a tenth."""
-    return {name: value.as_subclass(Tensor) for name, value in mapped.items()}
 
 
 def _pack_future(columns: dict[str, Tensor]) -> Tensor:

@@ -16,6 +16,7 @@ import flashdex.hands
 from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
 from flashdex.keys import FINGERS, SIDES, Side
+from flashdex.system.mjcf import check_mjcf
 
 # Six joints move the base: three slides, then hinges about z, x and -y. (name, axis)
 WRIST_JOINTS: tuple[tuple[str, tuple[float, float, float]], ...] = (
@@ -122,7 +123,8 @@ def load_hand(name: str) -> dict[Side, HandSpec]:
 
 def _make_spec(name: str, side: Side, facts: ModuleType) -> HandSpec:
     file = Path(str(facts.__file__)).with_name(f"{side}.xml")
-    mjcf = file.read_text()
+    mjcf = file.read_text(encoding="utf-8")
+    check_mjcf(mjcf, where=str(file))
     model = mujoco.MjSpec.from_string(mjcf).compile()
     _refuse_unsupported(model, where=str(file))
     links = [model.body(i).name for i in range(1, model.nbody)]

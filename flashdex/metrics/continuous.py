@@ -14,6 +14,8 @@ from flashdex.metrics.errors import position_error
 AUC_THRESHOLDS = tuple(k / 100 for k in range(1, 10))  # m
 PROBE = 0.05  # m, arm of the six body-fixed points of MPPE
 MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
+MIN_PATH = 0.03  # m, reference path below which the path ratio has no meaning
+RULER = 0.01  # m, by which a path is measured: noise at rest is no path
 
 
 def sample_vertices(vertices: Tensor, *, count: int = 500, seed: int = 42) -> Tensor:
@@ -77,6 +79,44 @@ def lift_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
     rise = (pos[:, 2] - pos[0, 2]).max()
     ref_rise = (ref_pos[:, 2] - ref_pos[0, 2]).max()
     return float(rise / ref_rise) if ref_rise >= MIN_LIFT else None
+
+
+def ruler_path(pos: Tensor) -> float:
+    """Path of positions (T, 3), m, by steps of a centimetre.
+
+    The ruler is laid on where the position has left its last end by its length; what
+    trembles nearer to it does not count.
+    """
+    points = pos.detach().cpu().double().numpy()
+    length, first = 0.0, 0
+    while first < len(points) - 1:
+        gap = np.linalg.norm(points[first + 1 :] - points[first], axis=1)
+        beyond = np.flatnonzero(gap >= RULER)
+        if not len(beyond):
+            return length + float(gap[-1])
+        length += float(gap[beyond[0]])
+        first += 1 + int(beyond[0])
+    return length
+
+
+def path_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
+    """Path simulated over reference; None if the reference's is shorter than 3 cm.
+
+    Positions are world, m, (T, 3); see ``ruler_path``.
+    """
+    ref = ruler_path(ref_pos)
+    return ruler_path(pos) / ref if ref >= MIN_PATH else None
+
+
+def off_by(ratio: float | None) -> float:
+    """How far a ratio is from 1, up or down alike: 0.25 for 1.25 and for 0.8.
+
+    At most 999, for a ratio of zero; 0 where there is none.
+    """
+    if ratio is None:
+        return 0.0
+    ratio = max(ratio, 1e-3)
+    return max(ratio, 1 / ratio) - 1
 
 
 def smoothness(qvel: Tensor, *, fps: float) -> float:

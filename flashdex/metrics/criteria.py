@@ -6,12 +6,14 @@ before what failed, so that all methods that share a motion share one denominato
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from flashdex.keys import SIDES, Side
+from flashdex.metrics.continuous import lift_ratio, off_by, path_ratio
 from flashdex.metrics.criteria_table import (
     Blame,
     Criterion,
@@ -34,8 +36,46 @@ __all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "s
 STATIC_DRIFT = 1e-3  # m; a reference that moves less on average counts as static
 
 
+def movement(errors: TrackingErrors, slot: int) -> dict[str, float | None]:
+    """Lift and path ratio of one object, None where the reference asks for none."""
+    track = errors.object_track(slot)
+    if track is None or len(track[0]) == 0:
+        return {"lift": None, "path": None}
+    return {"lift": lift_ratio(*track), "path": path_ratio(*track)}
+
+
+def worst_movement(errors: TrackingErrors) -> dict[str, float | None]:
+    """Lift and path ratio of the hands' object whose ratio is farthest from 1."""
+    slots = dict.fromkeys(errors.slots) if errors.is_finite else ()
+    found = [movement(errors, slot) for slot in slots]
+    return {
+        key: max(
+            (m[key] for m in found if m[key] is not None), key=off_by, default=None
+        )
+        for key in ("lift", "path")
+    }
+
+
+def moves_too_little(ratios: Mapping[str, float | None]) -> bool:
+    """An object stays behind what the reference asks for, by lift or by path."""
+    limits = Limits()
+    allowed = {"lift": limits.lift, "path": limits.path}
+    return any(
+        (ratio := ratios.get(key)) is not None and ratio < 1 / (1 + limit)
+        for key, limit in allowed.items()
+    )
+
+
 def _series(errors: TrackingErrors, term: Term, side: int, grace: int) -> Tensor | str:
-    """One hand's error over the scored window, (T - grace,), or what is missing."""
+    """One hand's error over the scored window, (T - grace,), or what is missing.
+
+    Ratios of a whole movement are one value.
+    """
+    if term.quantity in ("lift", "path"):
+        if errors.object_pos_offset is None:
+            return f"missing:{errors.missing.get('object_pos', 'object_pos')}"
+        ratio = movement(errors, errors.hand_object[side])[term.quantity]
+        return torch.tensor([off_by(ratio)], dtype=torch.float64)
     source = {
         "object_pos": ("object_pos", errors.object_pos_error),
         "object_pos_centred": ("object_pos", errors.object_pos_offset),
@@ -47,7 +87,7 @@ def _series(errors: TrackingErrors, term: Term, side: int, grace: int) -> Tensor
     key, value = source[term.quantity]
     if value is None:
         return f"missing:{errors.missing.get(key, key)}"
-    is_object = term.quantity.startswith("object")
+    is_object = term.is_of_object
     window = value[grace:, errors.hand_object[side] if is_object else side]
     if term.quantity == "object_pos_centred":
         return centred_position_error(window)
@@ -69,7 +109,9 @@ def _is_beyond(value: Any, term: Term) -> Any:
 
 def _blame(term: Term, side: Side, series: Tensor, grace: int) -> Blame:
     rows = _is_beyond(series, term).nonzero()
-    frame = int(rows[0]) + grace if len(rows) else -1
+    # a ratio of the whole movement has no frame
+    has_frames = term.quantity not in ("lift", "path")
+    frame = int(rows[0]) + grace if len(rows) and has_frames else -1
     value = _reduce_time(series, term.time)
     return Blame(side, term.quantity, value, term.limit, frame)
 
@@ -116,7 +158,7 @@ def _measure(
     hands = [h for h in sides if errors.hand_active[h]]
     objects = _object_sides(errors, criterion, sides)
     for term in criterion.terms:
-        used = objects if term.quantity.startswith("object") else hands
+        used = objects if term.is_of_object else hands
         series = {
             h: cast(Tensor, _series(errors, term, h, criterion.grace)) for h in used
         }

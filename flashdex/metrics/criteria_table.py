@@ -18,7 +18,14 @@ from flashdex.keys import SIDES, Side
 ALIASES = {"sr_spider": "sr_spider_centred"}
 
 Quantity = Literal[
-    "object_pos", "object_pos_centred", "object_rot", "fingertip", "joint", "wrist_pos"
+    "object_pos",
+    "object_pos_centred",
+    "object_rot",
+    "lift",
+    "path",
+    "fingertip",
+    "joint",
+    "wrist_pos",
 ]
 TimeReduction = Literal["mean", "max", "p95"]
 HandReduction = Literal["worst", "mean"]
@@ -27,13 +34,15 @@ Family = Literal["mt", "spider", "chord", "completed"]
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the criteria; metres and radians."""
+    """Limits of the criteria; metres, radians, and shares for ``lift`` and ``path``."""
 
     object_pos: float = 0.03
     object_rot: float = math.radians(30)
     fingertip: float = 0.06
     joint: float = 0.08
     loose_pos: float = 0.10
+    lift: float = 0.25  # .8 to 1.25 of the rise of the reference
+    path: float = 0.50  # 2/3 to 1.5 of its path; a held object trembles
     spider_pos: float = 0.10
     spider_rot: float = 0.5
     chord_wrist: float = 0.15
@@ -43,13 +52,22 @@ class Limits:
 
 @dataclass(frozen=True)
 class Term:
-    """One error, its reductions over frames and hands, and its limit (m or rad)."""
+    """One error, its reductions over frames and hands, and its limit.
+
+    Limits are m or rad; of ``lift`` and ``path`` the share by which the ratio of
+    simulated to reference may differ from 1, up or down.
+    """
 
     quantity: Quantity
     limit: float
     time: TimeReduction = "mean"
     hands: HandReduction = "worst"
     strict: bool = False
+
+    @property
+    def is_of_object(self) -> bool:
+        """It is of a hand's object, not of the hand."""
+        return self.quantity.startswith("object") or self.quantity in ("lift", "path")
 
 
 @dataclass(frozen=True)
@@ -86,6 +104,11 @@ def _maniptrans(limits: Limits, grace: int) -> Iterable[Criterion]:
             yield Criterion(base + suffix, terms, "mt", grace)
         terms = _maniptrans_terms(limits, hand=hand, time="max")
         yield Criterion(f"{base}_frame", terms, "mt", grace)
+    # A mean of 3 cm lets an object stay where it is while the reference rises by less
+    # than 6 cm. This one asks for the movement as well.
+    moved = (Term("lift", limits.lift), Term("path", limits.path))
+    terms = (*_maniptrans_terms(limits, hand=False), *moved)
+    yield Criterion("sr_mt_obj_moved", terms, "mt", grace)
     terms = _maniptrans_terms(limits, hand=False, time="p95")
     yield Criterion("sr_mt_obj_p95", terms, "mt", grace)
     loose = replace(limits, object_pos=limits.loose_pos)
@@ -212,6 +235,7 @@ CriterionName = Literal[
     "sr_mt_obj_frame",
     "sr_mt_frame",
     "sr_mt_obj_p95",
+    "sr_mt_obj_moved",
     "sr_spider_centred",
     "sr_spider_raw",
     "sr_spider_worst",

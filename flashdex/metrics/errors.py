@@ -102,6 +102,14 @@ class TrackingErrors:
         """Object slot of a hand, -1 if it has none or does not take part."""
         return self.hand_object[side] if self.hand_active[side] else -1
 
+    def object_track(self, slot: int) -> tuple[Tensor, Tensor] | None:
+        """Positions of one object, simulated and reference, world, m, (T, 3) each."""
+        if self.object_pos_offset is None or self.ref_object_pos is None:
+            return None
+        offset = self.object_pos_offset[:, slot]
+        reference = self.ref_object_pos[: len(offset), slot]
+        return reference + offset, reference
+
     @property
     def slots(self) -> list[int]:
         """Slots of the hands' objects; a shared object appears once per hand."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from flashdex.datasets.demo import HumanDemo
-from flashdex.errors import DemoError, MeshError
+from flashdex.errors import DemoError, MeshError, is_of_machine
 
 Level = Literal["info", "warn", "reject"]
 Status = Literal["kept", "flagged", "rejected"]
@@ -48,6 +48,11 @@ def of_error(error: Exception) -> Finding:
     if isinstance(error, DemoError | MeshError):
         usual = "E_MESH" if isinstance(error, MeshError) else "E_DEMO"
         return reject(error.code or usual, error.text)
+    if is_of_machine(error):
+        text = (
+            f"{str(error) or 'not enough memory'}; not the recording's fault, so the "
+        )
+        return reject("E_MACHINE", f"{text}same command tries it again")
     if isinstance(error, OSError):  # a name too long, a folder that may not be entered
         return reject("E_FILE", f"cannot be read: {error}")
     return reject("E_READ", f"unforeseen {type(error).__name__}: {error}")

@@ -8,7 +8,7 @@ from flashdex.datasets.demo import HumanDemo
 from flashdex.datasets.tracks import angular_velocity, linear_velocity
 from flashdex.motions.contact.roles import NO_OBJECT, Interaction
 from flashdex.motions.contact.support import support_disks
-from flashdex.motions.library import NUM_OBJECT_SLOTS
+from flashdex.motions.library_format import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.retarget.solver import Choice
 from flashdex.motions.retarget.targets import Targets

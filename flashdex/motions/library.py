@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +13,9 @@ import trimesh
 from tensordict import TensorDict
 
 from flashdex.errors import LibraryError, nearest
-
-SCHEMA = 1
-NUM_OBJECT_SLOTS = 2
-FRAME_KEYS = (
-    *("joint_pos", "joint_vel"),
-    *("wrist_pos", "wrist_quat", "wrist_linvel", "wrist_angvel"),
-    *("keypoints", "keypoint_linvel", "tip_dist"),
-    *("object_pos", "object_quat", "object_linvel", "object_angvel"),
-)
-# How good the reference is, frame by frame; for reports, no training reads it.
-QUALITY_KEYS = ("tip_error", "penetration", "contact")
+from flashdex.motions.library_check import check_all, check_once, map_arrays
+from flashdex.motions.library_format import ARRAYS, read_manifest
+from flashdex.motions.library_meshes import Mesh, read_mesh
 
 
 @dataclass
@@ -31,11 +23,12 @@ class MotionLibrary:
     """Reference motions of one collection, never padded over time, never copied.
 
     ``frames`` (F,), ``motions`` (M,) and ``objects`` (Q,) are memory-mapped; motion
-    ``m`` owns the rows ``start[m] ... start[m] + length[m] - 1`` of ``frames``.
+    ``m`` owns the rows ``start[m] ... start[m] + length[m] - 1`` of ``frames``. The
+    maps are private: processes share their pages, and no write reaches the files.
 
     ``quality`` has a row a frame: ``tip_error`` (2, 5), m, robot pad to human tip;
     ``penetration`` (), m, deepest contact of a hand with an object; ``contact`` (2, 5),
-    human fingers in contact. It is None in older libraries.
+    human fingers in contact. It is None where none was measured.
 
     Example:
         >>> library = MotionLibrary.load("libraries/quickstart")  # doctest: +SKIP
@@ -48,38 +41,50 @@ class MotionLibrary:
     objects: TensorDict
     manifest: dict[str, Any]  # names, sources, licences, hashes, versions
     quality: TensorDict | None = None
+    content_hash: str = ""  # of all that the library on disk holds
+    _meshes: dict[str, Mesh] = field(default_factory=dict, repr=False)
 
     @classmethod
     def load(cls, path: str | Path) -> MotionLibrary:
-        """Open a directory that ``prepare`` wrote.
+        """Open a directory that ``prepare`` wrote; the first time all of it is checked.
+
+        No file is changed, and none names what is run: see ``docs/security.md``.
 
         Raises:
-            LibraryError: if it is missing, incomplete or of another schema.
+            LibraryError: it is missing, of another schema, damaged or changed.
         """
         path = Path(path)
-        manifest = _read_manifest(path)
-        parts = {}
-        for part in ("frames", "motions", "objects", "quality"):
-            if (path / part / "meta.json").is_file():
-                parts[part] = TensorDict.load_memmap(path / part)
-            elif part != "quality":
-                raise LibraryError(
-                    f"{path}: '{part}' is missing. Prepare it again: flashdex prepare"
-                )
-        library = cls(path=path, manifest=manifest, **parts)
-        library._check()
-        return library
+        manifest = read_manifest(path)
+        arrays = map_arrays(path, manifest)
+        check_once(path, manifest, arrays)
+        parts = {part: _as_tensors(arrays, part) for part in _parts(arrays)}
+        return cls(
+            path=path,
+            manifest=manifest.entries,
+            content_hash=manifest.sha256,
+            **parts,
+        )
 
-    def _check(self) -> None:
-        missing = sorted(set(FRAME_KEYS) - set(self.frames.keys()))
-        if missing:
-            raise LibraryError(f"{self.path}: frames lack {', '.join(missing)}.")
-        total = int(self.motions["length"].sum())
-        if total != len(self.frames) or len(self.names) != self.num_motions:
-            raise LibraryError(
-                f"{self.path}: {total} frames of {self.num_motions} motions announced, "
-                f"{len(self.frames)} frames of {len(self.names)} found."
-            )
+    def verify(self) -> list[str]:
+        """Everything that is wrong with the files, read now, whatever is remembered.
+
+        Empty where nothing is. A changed manifest is told as well.
+        """
+        try:
+            manifest = read_manifest(self.path)
+            faults = check_all(self.path, manifest, map_arrays(self.path, manifest))
+        except LibraryError as error:
+            return [str(error)]
+        if manifest.sha256 != self.content_hash:
+            faults.insert(0, "manifest.json: is not the one that was opened")
+        return faults
+
+    def motion_hash(self, row: int) -> str:
+        """SHA-256 of what a motion holds, whatever it is called.
+
+        Of its frames, its rate, hand, roles and supports, and all of its objects.
+        """
+        return self.manifest["motions"][row]["content_sha256"]
 
     @property
     def num_motions(self) -> int:
@@ -119,38 +124,41 @@ class MotionLibrary:
         return self.frames[self.index(motion, frame)]
 
     def parts(self, object_row: int) -> list[np.ndarray]:
-        """Convex parts of an object: vertices (V, 3), m, object frame, float32."""
+        """Convex parts of an object: vertices (V, 3), m, object frame, float32.
+
+        Raises:
+            LibraryError: a file is not the one that the library was made with.
+        """
         entry = self.manifest["objects"][object_row]
-        return [_read_vertices(self.path / file) for file in entry["parts"]]
+        return [self._mesh(file)[0] for file in entry["parts"]]
 
     def visual(self, object_row: int) -> trimesh.Trimesh:
-        """Visual mesh of an object, m, object frame."""
-        file = self.path / self.manifest["objects"][object_row]["visual"]
-        return trimesh.load_mesh(file, process=False)
+        """Visual mesh of an object, m, object frame.
+
+        Raises:
+            LibraryError: the file is not the one that the library was made with.
+        """
+        vertices, faces = self._mesh(self.manifest["objects"][object_row]["visual"])
+        return trimesh.Trimesh(vertices, faces, process=False)
+
+    def _mesh(self, file: str) -> Mesh:
+        # kept: scenes are built more than once, and a library may be renewed meanwhile
+        if file not in self._meshes:
+            digest = self.manifest["meshes"][file]
+            data = self.manifest["data"]
+            self._meshes[file] = read_mesh(self.path, data, file, digest)
+        return self._meshes[file]
 
 
-def _read_manifest(path: Path) -> dict[str, Any]:
-    file = path / "manifest.json"
-    if not file.is_file():
-        raise LibraryError(
-            f"{path} is not a motion library: no manifest.json. "
-            f"Make one: flashdex prepare --source ... --out {path}"
-        )
-    try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise LibraryError(f"{file}: not JSON ({error}).") from error
-    if manifest.get("schema") != SCHEMA:
-        raise LibraryError(
-            f"{path}: schema {manifest.get('schema')}, this version reads {SCHEMA}. "
-            f"Prepare it again."
-        )
-    return manifest
+def _parts(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    return list(dict.fromkeys(name.split("/")[0] for name in ARRAYS if name in arrays))
 
 
-def _read_vertices(file: Path) -> np.ndarray:
-    if not file.is_file():
-        raise LibraryError(f"{file} is missing. Prepare the library again.")
-    lines = file.read_text(encoding="ascii").splitlines()
-    rows = [line.split()[1:4] for line in lines if line.startswith("v ")]
-    return np.asarray(rows, dtype=np.float32)
+def _as_tensors(arrays: Mapping[str, np.ndarray], part: str) -> TensorDict:
+    """One table of the library: the mapped memory itself."""
+    tensors = {
+        name.removeprefix(f"{part}/"): torch.from_numpy(np.asarray(array))
+        for name, array in arrays.items()
+        if name.startswith(f"{part}/")
+    }
+    return TensorDict(tensors, batch_size=[len(next(iter(tensors.values())))])

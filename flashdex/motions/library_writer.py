@@ -2,42 +2,52 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
+import secrets
 import shutil
 import tempfile
-from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-import trimesh
-from tensordict import TensorDict
 
 from flashdex.errors import LibraryError
-from flashdex.keys import FINGERS, SIDES
-from flashdex.motions.library import (
+from flashdex.motions.library_check import (
+    check_all,
+    find_faults,
+    hash_rows,
+    map_arrays,
+)
+from flashdex.motions.library_format import (
+    ARRAYS,
+    CONVENTIONS,
     FRAME_KEYS,
+    MANIFEST,
+    MAX_MANIFEST,
+    OBJECT_KEYS,
     QUALITY_KEYS,
     SCHEMA,
+    parse_manifest,
+    read_manifest,
 )
+from flashdex.motions.library_meshes import write_meshes
 from flashdex.objects.asset import ObjectAsset
+from flashdex.system.arrays import write_array
+from flashdex.system.files import open_plain, waiting_lock, write_atomic
+from flashdex.system.names import check_name, file_stem
 
-# what is no part of the name of a folder, and how long one may be
+# what is no part of the name of an object, and how long one may be
 NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
-OBJECT_KEYS = ("points", "normals", "radius", "sdf", "sdf_origin", "sdf_spacing")
-OBJECT_KEYS += ("mass", "com", "inertia", "aabb")
-CONVENTIONS = {
-    "units": {"length": "m", "angle": "rad", "time": "s", "mass": "kg"},
-    "up": "z",
-    "quat": "wxyz",
-    "hands": list(SIDES),
-    "fingers": list(FINGERS),
-}
+# folders of a library's data, the one that is being written too
+DATA = re.compile(r"\.?data-[0-9a-f]{16}")
+TEMPORARY = re.compile(r"\.manifest\.json\.\d+\.tmp")
+LOCK, REPORT = ".library.lock", "report.csv"
+# what schema 1 kept beside its manifest
+OLD_PARTS = ("frames", "motions", "objects", "quality", "meshes")
 
 
 @dataclass
@@ -59,22 +69,30 @@ class MotionRecord:
 class LibraryWriter:
     """Collects motions and writes them as one library directory.
 
-    Everything is written to a temporary folder beside the target and renamed at the
-    end, so that a killed run leaves no library and an old one stays as it was. The
-    manifest may be given more entries (settings, versions, source).
+    All data goes to a new folder in the library; renaming ``manifest.json``, which
+    names that folder, is the step that puts it in place. A killed run leaves no
+    library, or the one that was there. The folder itself stays the same: it may be a
+    link, a mount point or the working directory.
+
+    The manifest may be given more entries (settings, versions, source).
+
+    Raises:
+        LibraryError: something else is in the place of the library.
     """
 
     def __init__(
         self, path: str | Path, *, hand: str, fps: float, manifest: dict | None = None
     ) -> None:
         self.path = Path(path)
-        self._manifest = {"schema": SCHEMA, **CONVENTIONS, "hand": hand, "fps": fps}
-        self._manifest |= manifest or {}
+        own = {"schema": SCHEMA, **CONVENTIONS, "hand": hand, "fps": float(fps)}
+        self._manifest = (manifest or {}) | own
         self._records: list[MotionRecord] = []
         self._objects: dict[str, ObjectAsset] = {}
+        check_target(self.path)
 
     def add(self, record: MotionRecord) -> None:
         """Add one motion; objects that are equal are stored once."""
+        check_name(record.name, what="motion", where=str(self.path))
         missing = [k for k in FRAME_KEYS if k not in record.frames]
         lengths = {len(v) for v in record.frames.values()}
         if missing or len(lengths) != 1:
@@ -90,150 +108,215 @@ class LibraryWriter:
         self._records.append(record)
 
     def write(self, *, report: str = "") -> Path:
-        """Write the library, with ``report`` as report.csv; replaces one of its name.
+        """Write the library, with ``report`` as report.csv; replaces what is there.
 
         Raises:
-            LibraryError: when there is nothing to write or the disk refuses; nothing
-                is left behind then.
+            LibraryError: there is nothing to write, something of it is no motion, or
+                the disk refuses; the library that was there is whole then.
         """
         if not self._records:
             raise LibraryError(f"{self.path}: no motion was kept; nothing to write.")
-        name, folder = self.path.name, self.path.parent
+        check_target(self.path)
+        is_new = not self.path.exists()
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(
-                prefix=f".{name}-", dir=folder, ignore_cleanup_errors=True
-            ) as work:
-                self._fill(Path(work), report)
-                _swap(Path(work), self.path)
-        except (OSError, RuntimeError) as error:
+            self.path.mkdir(parents=True, exist_ok=True)
+            with waiting_lock(self.path / "library"):
+                self._replace(report)
+        except OSError as error:
             raise LibraryError(
                 f"{self.path}: could not write the library ({error}). Check free "
-                f"space and permissions of {folder}."
+                f"space and permissions of {self.path.absolute().parent}."
             ) from error
+        finally:
+            if is_new and not (self.path / MANIFEST).exists():
+                _remove_empty(self.path)
         return self.path
 
-    def _fill(self, work: Path, report: str) -> None:
-        os.chmod(work, 0o755)  # mkdtemp makes it private
+    def _replace(self, report: str) -> None:
+        data, is_old = f"data-{secrets.token_hex(8)}", _is_old(self.path)
+        work = self.path / f".{data}"
+        try:
+            work.mkdir()
+            manifest = self._fill(work) | {"data": data}
+            # names of files and texts in them may hold what is no character
+            told = report.encode("utf-8", errors="backslashreplace")
+            (work / REPORT).write_bytes(told)
+            # runs of a sweep prepare the same and read what is there already
+            if _is_whole(self.path, parse_manifest(manifest).sha256):
+                os.replace(work / REPORT, self.path / REPORT)
+                return
+            os.replace(work, self.path / data)
+            write_atomic(self.path / MANIFEST, json.dumps(manifest, indent=1))
+            # what needs room on the disk is done: from here on nothing can be lost
+            os.replace(self.path / data / REPORT, self.path / REPORT)
+        finally:
+            # what this or a killed writer left, or the library before
+            _clean(self.path, parts=OLD_PARTS if is_old else ())
+
+    def _fill(self, work: Path) -> dict[str, Any]:
+        """Write all data; return the manifest, but for the name of its folder."""
+        objects, meshes = self._write_objects(work)
+        arrays = self._stack()
+        motions = [{**r.info, "name": r.name} for r in self._records]
+        manifest = self._manifest | {"motions": motions, "objects": objects}
+        hashes = hash_rows(manifest, arrays, meshes)
+        for rows, digests in zip((motions, objects), hashes, strict=True):
+            for row, digest in zip(rows, digests, strict=True):
+                row["content_sha256"] = digest
+        for part in dict.fromkeys(name.split("/")[0] for name in arrays):
+            (work / part).mkdir()
+        written = {n: write_array(work / f"{n}.npy", a) for n, a in arrays.items()}
+        manifest["meshes"] = meshes
+        manifest["arrays"] = {name: e.to_dict() for name, e in written.items()}
+        # what is written can be opened, or the old one stays
+        manifest = json.loads(json.dumps(manifest))
+        parsed = parse_manifest(manifest | {"data": "data-" + 16 * "0"})
+        if faults := find_faults(parsed, arrays):
+            raise LibraryError(f"{self.path}: is not written: {'; '.join(faults[:5])}")
+        return manifest
+
+    def _write_objects(self, work: Path) -> tuple[list[dict], dict[str, str]]:
+        """Write all meshes; return entries of the objects, and hashes of the files."""
         assets = list(self._objects.values())
-        names = _unique_names(assets)
-        files = [_write_meshes(work, *pair) for pair in zip(names, assets, strict=True)]
-        tables = {
-            "frames": self._stack_rows("frames", FRAME_KEYS).float(),
-            "motions": self._stack_motions(),
-            "objects": _stack_objects(assets),
+        entries, meshes = [], {}
+        for name, asset in zip(_unique_names(assets), assets, strict=True):
+            files, hashes = write_meshes(work, name, asset)
+            told = {"sha256": asset.sha256, "watertight": bool(asset.watertight)}
+            entries.append({"name": name, **told, **files})
+            meshes |= hashes
+        return entries, meshes
+
+    def _stack(self) -> dict[str, np.ndarray]:
+        """All arrays of the library, each of its declared type."""
+        assets = self._objects.values()
+        columns = {
+            f"objects/{key}": np.stack([getattr(asset, key) for asset in assets])
+            for key in OBJECT_KEYS
         }
+        tables = {"frames": FRAME_KEYS}
         if all(r.quality for r in self._records):
-            tables["quality"] = self._stack_rows("quality", QUALITY_KEYS)
-        # Writing to a mapped file on a full disk kills the process: ask beforehand.
-        needed = sum(table.bytes() for table in tables.values())
-        free = shutil.disk_usage(work).free
-        if needed > free:
-            raise OSError(
-                errno.ENOSPC, f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
-            )
-        for name, table in tables.items():
-            table.memmap(str(work / name))
-        manifest = self._manifest | {
-            "motions": [{"name": r.name, **r.info} for r in self._records],
-            "objects": [
-                {"name": n, "sha256": a.sha256, "watertight": bool(a.watertight), **f}
-                for n, a, f in zip(names, assets, files, strict=True)
-            ],
-        }
-        # names of files and texts in them may hold what is no character
-        told = report.encode("utf-8", errors="backslashreplace")
-        (work / "report.csv").write_bytes(told)
-        text = json.dumps(manifest, indent=1)
-        (work / "manifest.json").write_text(text, encoding="utf-8")
+            tables["quality"] = QUALITY_KEYS
+        for part, keys in tables.items():
+            rows = [getattr(record, part) for record in self._records]
+            for key in keys:
+                columns[f"{part}/{key}"] = np.concatenate([row[key] for row in rows])
+        columns |= self._stack_motions()
+        return {k: np.asarray(v, ARRAYS[k][0]) for k, v in columns.items()}
 
-    def _stack_rows(self, part: str, keys: Iterable[str]) -> TensorDict:
-        """Frames of all motions on one axis."""
-        rows = [getattr(record, part) for record in self._records]
-        columns = {k: np.concatenate([row[k] for row in rows]) for k in keys}
-        tensors = {k: torch.as_tensor(v) for k, v in columns.items()}
-        return TensorDict(tensors).auto_batch_size_(1)
-
-    def _stack_motions(self) -> TensorDict:
-        lengths = torch.tensor([len(r.frames["joint_pos"]) for r in self._records])
+    def _stack_motions(self) -> dict[str, np.ndarray]:
+        records = self._records
+        lengths = np.array([len(r.frames["joint_pos"]) for r in records])
         rows = {sha: i for i, sha in enumerate(self._objects)}
-        slots = self._records[0].frames["object_pos"].shape[1]
-        index = torch.full((len(self._records), slots), -1)
-        for i, record in enumerate(self._records):
+        slots = records[0].frames["object_pos"].shape[1]
+        index = np.full((len(records), slots), -1)
+        for i, record in enumerate(records):
             for slot, asset in enumerate(record.objects):
                 index[i, slot] = rows[asset.sha256]
-        disks = np.stack([r.support_disks for r in self._records])
-        return TensorDict(
-            {
-                "start": lengths.cumsum(0) - lengths,
-                "length": lengths,
-                "hand_active": torch.tensor([r.hand_active for r in self._records]),
-                "hand_object": torch.tensor([r.hand_object for r in self._records]),
-                "object_index": index,
-                "support_disks": torch.as_tensor(disks).float(),
-            },
-            batch_size=[len(self._records)],
-        )
-
-
-def _stack_objects(assets: list[ObjectAsset]) -> TensorDict:
-    stacked = {
-        key: torch.as_tensor(np.stack([getattr(a, key) for a in assets])).float()
-        for key in OBJECT_KEYS
-    }
-    return TensorDict(stacked, batch_size=[len(assets)])
+        return {
+            "motions/start": lengths.cumsum() - lengths,
+            "motions/length": lengths,
+            "motions/hand_active": np.array([r.hand_active for r in records]),
+            "motions/hand_object": np.array([r.hand_object for r in records]),
+            "motions/object_index": index,
+            "motions/support_disks": np.stack([r.support_disks for r in records]),
+        }
 
 
 def _unique_names(assets: list[ObjectAsset]) -> list[str]:
-    """Names of folders: a dataset may call its objects anything, "../x" as well."""
-    names: dict[str, None] = {}
+    """Names of objects that can be shown and stored: a dataset may say "../x"."""
+    names: dict[str, str] = {}
     for asset in assets:
-        plain = NO_NAME.sub("_", asset.name).lstrip(".")[:NAME_LENGTH] or "object"
+        plain = NO_NAME.sub("_", asset.name).lstrip(".")[:NAME_LENGTH].strip()
+        plain = plain or "object"
         name, count = plain, 1
-        while name in names:
+        while file_stem(name).casefold() in names:
             count += 1
             name = f"{plain}_{count}"
-        names[name] = None
-    return list(names)
+        names[file_stem(name).casefold()] = name
+    return list(names.values())
 
 
-def _write_meshes(work: Path, name: str, asset: ObjectAsset) -> dict[str, Any]:
-    folder = Path("meshes") / name
-    (work / folder).mkdir(parents=True)
-    parts = []
-    for i, part in enumerate(asset.parts):
-        file = folder / f"part_{i:03d}.obj"
-        hull = trimesh.convex.convex_hull(part)
-        # its faces, of the part's vertices in the order that they have
-        gaps = np.linalg.norm(hull.vertices[:, None] - part[None], axis=-1)
-        _write_obj(work / file, part, gaps.argmin(axis=1)[hull.faces])
-        parts.append(str(file))
-    visual = folder / "visual.obj"
-    _write_obj(work / visual, asset.visual_vertices, asset.visual_faces)
-    return {"parts": parts, "visual": str(visual)}
+def check_target(path: Path) -> None:
+    """Refuse a folder that no library may be written to, before the work.
 
-
-def _write_obj(file: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices)]
-    lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(faces) + 1]
-    file.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def _swap(work: Path, target: Path) -> None:
-    """Put ``work`` in the place of ``target``; the old one is kept until it stands."""
-    old = None
-    if target.exists():
-        if not (target / "manifest.json").is_file():
-            raise LibraryError(
-                f"{target} exists and is not a motion library; it is not replaced."
-            )
-        old = target.with_name(f".{target.name}-old-{os.getpid()}")
-        os.replace(target, old)
+    Raises:
+        LibraryError: it holds other files, is none, or cannot be written.
+    """
+    folder = path
+    while not os.path.lexists(folder) and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir():
+        kind = "a link to nothing" if folder.is_symlink() else "not a folder"
+        raise LibraryError(f"{path}: could not write the library: {folder} is {kind}.")
     try:
-        os.replace(work, target)
-    except OSError:
-        if old is not None:
-            os.replace(old, target)
-        raise
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise LibraryError(
+            f"{path}: could not write the library: {folder} refuses ({error.strerror})."
+        ) from error
+    if folder is path:
+        held = [n for n in os.listdir(path) if n != LOCK]
+        ours = [n for n in held if DATA.fullmatch(n) or TEMPORARY.fullmatch(n)]
+        if len(ours) < len(held) and not _is_library(path):
+            raise LibraryError(
+                f"{path} exists and is not a motion library; it is not replaced. Name "
+                "another folder, or empty this one."
+            )
+
+
+def _is_library(path: Path) -> bool:
+    """Whether the manifest is one of a library, of any version and in any state."""
+    if (entries := _read_old(path)) is not None:
+        return isinstance(entries, dict) and {"schema", "motions"} <= set(entries)
+    # a damaged one is replaced where its data is there
+    is_manifest = (path / MANIFEST).is_file()
+    return is_manifest and any(DATA.fullmatch(name) for name in os.listdir(path))
+
+
+def _read_old(path: Path) -> Any:
+    """The manifest that is there; None where there is none that can be read."""
+    with (
+        suppress(OSError, ValueError, RecursionError),
+        open_plain(path / MANIFEST) as f,
+    ):
+        return json.loads(f.read(MAX_MANIFEST).decode("utf-8"))
+    return None
+
+
+def _is_whole(path: Path, sha256: str) -> bool:
+    """Whether a library of this hash is there, and nothing in it is damaged."""
+    try:
+        found = read_manifest(path)
+        if found.sha256 != sha256:
+            return False
+        return not check_all(path, found, map_arrays(path, found))
+    except LibraryError:
+        return False
+
+
+def _is_old(path: Path) -> bool:
+    entries = _read_old(path)
+    return isinstance(entries, dict) and entries.get("schema") == 1
+
+
+def _clean(path: Path, *, parts: tuple[str, ...]) -> None:
+    """Remove data that the manifest does not name, by the names that writers give."""
+    entries = _read_old(path)
+    keep = entries.get("data") if isinstance(entries, dict) else None
+    is_told = isinstance(keep, str) or not os.path.lexists(path / MANIFEST)
+    if not is_told:  # it cannot be read at the moment: all might be needed
+        return
+    for name in os.listdir(path):
+        if name != keep and (DATA.fullmatch(name) or name in parts):
+            # of a link only complains, and never follows one
+            shutil.rmtree(path / name, ignore_errors=True)
+        elif TEMPORARY.fullmatch(name):
+            with suppress(OSError):
+                (path / name).unlink()
+
+
+def _remove_empty(path: Path) -> None:
+    with suppress(OSError):
+        (path / LOCK).unlink(missing_ok=True)
+        path.rmdir()

@@ -6,9 +6,7 @@ import hashlib
 import json
 import logging
 import os
-import zipfile
-import zlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from flashdex.errors import FlashdexError
+from flashdex.objects.bodies import bounds_volume, fault_of_mass
 from flashdex.objects.convex import compute_convex_parts, compute_mass_properties
 from flashdex.objects.meshes import (
     clean_mesh,
@@ -24,14 +24,20 @@ from flashdex.objects.meshes import (
     sample_surface_points,
 )
 from flashdex.objects.signed_distance import make_distance_grid
+from flashdex.system.archives import read_npz
 from flashdex.system.files import open_atomic, waiting_lock
 
 logger = logging.getLogger(__name__)
 
-CACHE_VERSION = 1  # raise when the same mesh and settings give another asset
+CACHE_VERSION = 2  # raise when the same mesh and settings give another asset
 MAX_VISUAL_FACES = 5000
 MAX_WORK_FACES = 32000  # more only cost time in CoACD and the winding number
-DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+# what a torn, damaged or foreign file in the cache raises
+DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError),
+    RecursionError,
+)
+MAX_CACHED = 256 << 20  # bytes of an unpacked file of the cache
 
 Floats = NDArray[np.float32]
 Values = dict[str, Any]  # computed field of ObjectAsset to its value
@@ -74,8 +80,16 @@ class ObjectAsset:
     visual_faces: NDArray[np.int32]  # triangles of the visual vertices, (F, 3)
 
 
-_COMPUTED = {f.name for f in fields(ObjectAsset)} - {"name", "sha256"}
 _SCALARS = ("radius", "sdf_spacing", "mass", "watertight")
+_MASS = ("mass", "com", "inertia", "aabb")
+# arrays of a file of the cache and their shapes; 0 for any length
+_STORED: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys(_SCALARS, ()),
+    **dict.fromkeys(("com", "sdf_origin"), (3,)),
+    **dict.fromkeys(("points", "normals", "part_vertices"), (0, 3)),
+    **dict.fromkeys(("visual_vertices", "visual_faces"), (0, 3)),
+    **{"inertia": (3, 3), "aabb": (2, 3), "sdf": (0, 0, 0), "part_sizes": (0,)},
+}
 
 
 def make_object(
@@ -134,9 +148,17 @@ def read_object(
 
 
 def default_cache_dir() -> Path:
-    """``$FLASHDEX_CACHE``, else ``~/.cache/flashdex``."""
+    """``$FLASHDEX_CACHE``, else ``~/.cache/flashdex``.
+
+    Raises:
+        FlashdexError: there is no home either.
+    """
     chosen = os.environ.get("FLASHDEX_CACHE")
-    return Path(chosen) if chosen else Path.home() / ".cache" / "flashdex"
+    try:
+        return Path(chosen) if chosen else Path.home() / ".cache" / "flashdex"
+    except RuntimeError as error:
+        text = "no home directory to keep prepared objects in; set FLASHDEX_CACHE to "
+        raise FlashdexError(f"{text}a folder.") from error
 
 
 def _cache_file(key: str, cache_dir: Path | None) -> Path:
@@ -162,7 +184,7 @@ def _fingerprint(mesh: trimesh.Trimesh, settings: ObjectSettings) -> str:
 
 def _compute(mesh: trimesh.Trimesh, settings: ObjectSettings, where: str) -> Values:
     mesh = clean_mesh(mesh, name=where)
-    watertight = bool(mesh.is_volume)
+    watertight = bounds_volume(mesh)
     small = reduce_mesh(mesh, max_faces=MAX_WORK_FACES)
     visual = reduce_mesh(mesh, max_faces=MAX_VISUAL_FACES)
     points, normals = sample_surface_points(
@@ -177,7 +199,11 @@ def _compute(mesh: trimesh.Trimesh, settings: ObjectSettings, where: str) -> Val
         name=where,
     )
     mass, com, inertia = compute_mass_properties(
-        mesh, parts, density=settings.density, mass_limits=settings.mass_limits
+        mesh,
+        parts,
+        density=settings.density,
+        mass_limits=settings.mass_limits,
+        name=where,
     )
     sdf, origin, spacing = make_distance_grid(
         small,
@@ -209,6 +235,30 @@ def _compute(mesh: trimesh.Trimesh, settings: ObjectSettings, where: str) -> Val
     }
 
 
+def _check_stored(stored: Values) -> None:
+    """Refuse arrays of the cache that no object has: what wrote them was not we.
+
+    Raises:
+        ValueError: other fields, shapes or values.
+    """
+    if set(stored) != set(_STORED):
+        raise ValueError(f"fields {sorted(set(_STORED) ^ set(stored))}")
+    for name, shape in _STORED.items():
+        array = stored[name]
+        fits = array.ndim == len(shape) and array.dtype.kind in "biuf"
+        wanted = np.array([n or m for n, m in zip(shape, array.shape, strict=False)])
+        if not fits or (wanted != array.shape).any() or not np.isfinite(array).all():
+            raise ValueError(f"{name}: {array.dtype} {array.shape}, or not finite")
+    sizes = stored["part_sizes"]
+    if sizes.min(initial=0) < 0 or sizes.sum() != len(stored["part_vertices"]):
+        raise ValueError("convex parts of other sizes")
+    faces = stored["visual_faces"]
+    if faces.min(initial=0) < 0 or faces.max() >= len(stored["visual_vertices"]):
+        raise ValueError("triangles of vertices that are not there")
+    if fault := fault_of_mass(*(stored[key] for key in _MASS)):
+        raise ValueError(fault)
+
+
 def _write_cache(file: Path, values: Values) -> None:
     """Store the fields of an object as npz; a failure is logged and not fatal."""
     arrays: Values = {k: np.asarray(v) for k, v in values.items() if k != "parts"}
@@ -226,14 +276,12 @@ def _read_cache(file: Path) -> Values | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            values: Values = {k: stored[k] for k in stored.files}
+        values: Values = dict(read_npz(file, limit=MAX_CACHED))
+        _check_stored(values)
         cuts = np.cumsum(values.pop("part_sizes"))[:-1]
         values["parts"] = np.split(values.pop("part_vertices"), cuts)
         for scalar in _SCALARS:
             values[scalar] = values[scalar].item()
-        if set(values) != _COMPUTED:
-            raise KeyError(*sorted(_COMPUTED ^ set(values)))
     except DAMAGED as error:
         logger.warning("%s: unreadable (%s); computing the object again", file, error)
         return None

@@ -10,7 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from flashdex.errors import MeshError
 from flashdex.geometry.points import farthest_point_sampling
+from flashdex.objects.bodies import bounds_volume, fault_of_mass
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ def compute_convex_parts(
         volume first.
     """
     whole = mesh.convex_hull
-    convex = mesh.is_volume and mesh.volume > (1 - CONVEX_TOLERANCE) * whole.volume
+    convex = bounds_volume(mesh) and mesh.volume > (1 - CONVEX_TOLERANCE) * whole.volume
     hulls = []
     split = not convex and max_parts > 1
     for vertices in _run_coacd(mesh, max_parts, threshold, seed, name) if split else []:
@@ -69,7 +71,7 @@ def _run_coacd(
             mcts_iterations=SEARCH_ITERATIONS,
             seed=seed,
         )
-    except (RuntimeError, OSError) as error:
+    except RuntimeError as error:
         logger.warning("%s: CoACD failed (%s); one convex hull instead", name, error)
         return []
     if len(parts) > max_parts:
@@ -97,20 +99,38 @@ def compute_mass_properties(
     *,
     density: float,
     mass_limits: tuple[float, float],
+    name: str,
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Mass, centre of mass and inertia of a homogeneous solid.
 
     The solid is the mesh (cleaned, m) where it bounds a volume, else the sum of its
-    convex parts (vertices, m, each (V, 3)). Density is kg/m^3, limits are kg.
+    convex parts (vertices, m, each (V, 3)). Density is kg/m^3, limits are kg. What no
+    body can have is not taken from a mesh, whatever it bounds.
     ``inertia = mass / volume * (integral of |r|^2 1 - r r^T over the solid)``.
 
     Returns:
         Mass, kg; centre of mass in the object frame, m, (3,); inertia about the centre
         of mass in object axes, kg m^2, (3, 3), positive definite with every moment
         below the sum of the other two.
+
+    Raises:
+        MeshError: not even the parts have such; ``name`` is for it.
     """
-    hulls = map(trimesh.convex.convex_hull, parts)
-    solids = [mesh] if mesh.is_volume else list(hulls)
+    corners = np.asarray(mesh.convex_hull.vertices)
+    if bounds_volume(mesh):
+        found = _sum_of_solids([mesh], density, mass_limits)
+        if not fault_of_mass(*found, corners):
+            return found
+    hulls = [trimesh.convex.convex_hull(part) for part in parts]
+    found = _sum_of_solids(hulls, density, mass_limits)
+    if fault := fault_of_mass(*found, corners):
+        raise MeshError(f"{name}: {fault}. Are its triangles facing outward?")
+    return found
+
+
+def _sum_of_solids(
+    solids: list[trimesh.Trimesh], density: float, mass_limits: tuple[float, float]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     volumes = np.array([s.volume for s in solids])
     centres = np.array([s.center_mass for s in solids])
     volume = float(volumes.sum())

@@ -10,13 +10,12 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
-from flashdex.errors import MeshError
+from flashdex.errors import MeshError, is_of_machine
+from flashdex.objects.bodies import make_winding_consistent, orient_bodies
+from flashdex.objects.mesh_files import MESH_SUFFIXES, read_scene
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 1.5  # m; outside, the unit is almost surely wrong
 MIN_PART_AREA = 0.01  # share of the area below which a loose component is dropped
-# others of trimesh unpack archives, or read what they name from other files
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
-MAX_FACES = 5_000_000  # a scene may hold the same geometry any number of times
 SAMPLES_PER_POINT = 64  # density of the sample that farthest points are chosen from
 
 
@@ -26,7 +25,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     Scenes become one mesh, each geometry moved by the transform of its node.
 
     Raises:
-        MeshError: the file is missing or cannot be read.
+        MeshError: the file is missing or is not such a mesh.
+        OSError, MemoryError: the machine fails, see ``is_of_machine``.
     """
     if not path.is_file():
         raise MeshError(f"{path}: mesh file not found. Check the path in the source.")
@@ -35,12 +35,14 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
             f"{path}: not readable as a mesh. Allowed: {', '.join(MESH_SUFFIXES)}."
         )
     try:
-        scene = trimesh.load_scene(path, process=False, skip_materials=True)
-        _refuse_large(scene)
-        mesh = scene.to_mesh()
+        mesh = read_scene(path).to_mesh()
+        if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+            raise ValueError("not triangles of points in space")
         if len(mesh.faces) and not _joins_vertices(mesh):
             raise ValueError("triangles of vertices that are not there")
     except Exception as error:  # each reader of trimesh fails in its own way
+        if is_of_machine(error):
+            raise
         text = f"{path}: not readable as a mesh ({error}). Allowed: "
         raise MeshError(f"{text}{', '.join(MESH_SUFFIXES)}.") from error
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -50,18 +52,12 @@ def _joins_vertices(mesh: trimesh.Trimesh) -> bool:
     return mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
 
 
-def _refuse_large(scene: trimesh.Scene) -> None:
-    shapes = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-    faces = sum(len(getattr(scene.geometry[s], "faces", ())) for s in shapes)
-    if faces > MAX_FACES:
-        raise ValueError(f"{faces} triangles; at most {MAX_FACES}")
-
-
 def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     """A mesh (m) with what can be repaired without changing its shape; a new one.
 
     Merges vertices, drops faces without area and loose components below 1 % of the
-    area, makes the winding consistent and outward, closes small holes; others stay.
+    area, makes the winding consistent, bodies outward and cavities inward, closes small
+    holes; others stay.
     The name, of a file or object, is for messages.
 
     Raises:
@@ -75,11 +71,12 @@ def clean_mesh(mesh: trimesh.Trimesh, *, name: str) -> trimesh.Trimesh:
     _drop_loose_components(mesh)
     mesh.remove_unreferenced_vertices()
     _refuse_flat(mesh, name)
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-        trimesh.repair.fix_inversion(mesh, multibody=True)
+    make_winding_consistent(mesh)
     if not mesh.is_watertight:
         trimesh.repair.fill_holes(mesh)
+        mesh.update_faces(mesh.unique_faces())  # a triangle is not closed by its back
+    orient_bodies(mesh)
+    mesh.remove_unreferenced_vertices()
     if mesh.volume < 0:
         mesh.invert()
     return mesh

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
+from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import Rollout
 
@@ -24,34 +26,46 @@ def grace_steps(fps: float) -> int:
     return round(GRACE_S * fps)
 
 
+def link_names(hands: dict[keys.Side, HandSpec]) -> str:
+    """Names of the bodies behind ``joints`` of a rollout, JSON, both hands."""
+    return json.dumps(
+        [
+            [hand.link_names[i] for i, _ in [*hand.level1_links, *hand.distal_links]]
+            for hand in (hands[side] for side in keys.SIDES)
+        ]
+    )
+
+
 class RolloutBuilder:
     """Builds rollouts from recorded episodes, on the CPU, where ``bank`` must be.
 
     ``scenes`` has one a motion; ``made_by`` and ``provenance`` (hashes of recipe and
-    library, date) are stored with every rollout.
+    library, date, physics settings) are stored with every rollout; ``motion_hash``
+    gives the hash of a motion by its row.
     """
 
     def __init__(
         self,
         bank: ReferenceBank,
         hands: dict[keys.Side, HandSpec],
-        scenes: list[Scene],
+        scenes: Sequence[Scene] | Mapping[int, Scene],
         *,
         decimation: int,
         criterion: str,
         seed: int,
         made_by: dict[str, Any],
-        provenance: dict[str, str] | None = None,
+        provenance: dict[str, Any] | None = None,
+        motion_hash: Callable[[int], str] | None = None,
     ) -> None:
         self.bank, self.scenes = bank, scenes
+        self._provenance, self._motion_hash = provenance or {}, motion_hash
         self.kinematics = HandKinematics(hands)
-        links, keypoints, bodies = [], [], []
+        links, keypoints = [], []
         for side in keys.SIDES:
             hand = hands[side]
             pairs = [*hand.level1_links, *hand.distal_links]
             links.append([link for link, _ in pairs])
             keypoints.append([hand.keypoint_links.index(pair) for pair in pairs])
-            bodies.append([hand.link_names[link] for link, _ in pairs])
         # (2, M): links of ``joints``, and the rows of their human keypoints
         self._links, self._keypoints = torch.tensor(links), torch.tensor(keypoints)
         self._of_run: dict[str, Any] = {
@@ -62,8 +76,7 @@ class RolloutBuilder:
             "criterion": criterion,
             "versions": json.dumps(made_by),
             "seed": seed,
-            "provenance": json.dumps(provenance or {}),
-            "joint_bodies": json.dumps(bodies),
+            "joint_bodies": link_names(hands),
         }
 
     def build(self, episode: Episode) -> Rollout:
@@ -103,6 +116,10 @@ class RolloutBuilder:
             env_steps=episode.env_steps,
             num_ref_frames=int(bank.length[motion]) - 1,
         )
+        bound = bindings_of(rollout)
+        if self._motion_hash is not None:
+            bound["motion_sha256"] = self._motion_hash(motion)
+        rollout.provenance = json.dumps({**self._provenance, **bound})
         rollout.terminations = [
             {"cause": name, "hand": side}
             for name, blamed in episode.causes.items()

@@ -37,7 +37,7 @@ from flashdex.rollouts.safety import (
 )
 from flashdex.system.files import write_atomic
 
-CERTIFICATE_SCHEMA = 1
+CERTIFICATE_SCHEMA = 2  # 1 did not name its rollout
 PROVEN = ("certified", "robust")  # verdicts of a conversion that holds
 ROBUST_SHARE = 0.75  # 6 of 8 perturbed runs
 # mm; the scored object positions and the stored states are copies of one another
@@ -82,8 +82,12 @@ def certify(
     num_perturbations: int = 8,
     seed: int = 0,
     sizes: Perturbation = PERTURBATION,
+    model: mujoco.MjModel | None = None,
 ) -> Certificate:
     """Replay a rollout nominally and perturbed, and score it by its own criterion.
+
+    A ``model`` that is given was compiled from the text in the rollout by somebody who
+    trusts that text; it is checked, tried and compiled otherwise.
 
     The same file gives the same certificate on the same versions and processor type.
 
@@ -92,7 +96,7 @@ def certify(
         'robust'
     """
     criterion = resolve_criterion(rollout.criterion)
-    sim = load_simulation(rollout)
+    sim = load_simulation(rollout, model)
     monitor = SafetyMonitor(sim.model, sim.object_body)
     nominal = resimulate(sim, monitor=monitor)
     runs = [
@@ -164,6 +168,7 @@ def _identity(rollout: Rollout, criterion: str) -> dict[str, Any]:
     return {
         "schema": CERTIFICATE_SCHEMA,
         "motion": rollout.motion,
+        "rollout_sha256": rollout.content_sha256,
         "hand": rollout.hand,
         "criterion": criterion,
         "grace": rollout.grace,

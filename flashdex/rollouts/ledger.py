@@ -4,19 +4,85 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import mujoco
 
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
+from flashdex.metrics.criteria import moves_too_little
 from flashdex.rollouts.certificate import PROVEN, certify
+from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.arrays import hash_content
+from flashdex.system.files import own_file, own_folder
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
+from flashdex.system.names import check_name, check_names, file_stem
 
 _LOG = logging.getLogger(__name__)
 CONVERSIONS = "conversions.jsonl"
 ROLLOUTS = "rollouts"
+UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
+# what a line holds, of any version
+LINE: dict[str, type | tuple[type, ...]] = {
+    "motion": str,
+    "converted": bool,
+    "criterion": str,
+    "errors": dict,
+    "env_steps": int,
+    "wall_s": float,
+}
+# what newer versions, or only some lines, hold besides; null stands for nothing
+_MORE: dict[str, type] = {
+    **dict.fromkeys(("passed", "hands", "why", "trivial"), list),
+    **dict.fromkeys(("rollout", "verdict", "engine"), str),
+    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), str),
+    **dict.fromkeys(("certified", "completed"), bool),
+    **dict.fromkeys(("frame", "seed"), int),
+}
+
+
+def read_ledger(path: Path) -> list[dict[str, Any]]:
+    """The lines of ``conversions.jsonl``.
+
+    Raises:
+        RunError: one is no line of a ledger, or was changed; it is named.
+    """
+    lines = read_lines(path, LINE)
+    for number, line in enumerate(lines, start=1):
+        where = f"{path}: line {number}"
+        check_name(line["motion"], what="motion", where=where)
+        if not math.isfinite(line["wall_s"]):
+            raise RunError(f"{where} has {line['wall_s']} as 'wall_s'.")
+        for key, kind in _MORE.items():
+            value = line.get(key)
+            if value is not None and type(value) is not kind:
+                raise RunError(
+                    f"{where} has {value!r:.60} as '{key}'. flashdex only adds lines "
+                    "to this file; restore it from a copy."
+                )
+    return lines
+
+
+def rollout_name(motion: str) -> str:
+    """Where a run keeps the rollout of a motion: the only place a line may name."""
+    return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
+
+
+def certificate_name(motion: str) -> str:
+    """Where a run keeps the certificate of a motion."""
+    return f"{ROLLOUTS}/{file_stem(motion)}.certificate.json"
+
+
+def is_trivial(line: dict[str, Any]) -> bool:
+    """A conversion that needed no learning, or in which the object hardly moved."""
+    return bool(line.get("trivial"))
+
+
+def _is_more(line: dict[str, Any], before: dict[str, Any]) -> bool:
+    """A pass in which the object moves, after one in which it hardly did."""
+    return UNMOVED in before.get("trivial", []) and UNMOVED not in line["trivial"]
 
 
 class Ledger:
@@ -41,9 +107,10 @@ class Ledger:
         certify: bool = True,
         trivial: dict[str, list[str]] | None = None,
     ) -> None:
-        self.path = run_dir / CONVERSIONS
-        self.rollouts = run_dir / ROLLOUTS
-        self.rollouts.mkdir(parents=True, exist_ok=True)
+        check_names(names, what="motion")
+        run_dir.mkdir(parents=True, exist_ok=True)
+        self.run_dir, self.path = run_dir, own_file(run_dir, CONVERSIONS)
+        self.rollouts = own_folder(run_dir, ROLLOUTS)
         self.names, self.criterion, self.seed = names, criterion, seed
         self.engine, self.on_gpu = engine, on_gpu
         self.certify, self.trivial = certify, trivial or {}
@@ -52,33 +119,52 @@ class Ledger:
         self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
         self.attempts: dict[str, int] = dict.fromkeys(names, 0)  # motion -> lines
         drop_cut_line(self.path)
-        for line in read_lines(self.path):  # of earlier sessions
+        for line in read_ledger(self.path):  # of earlier sessions
             # A resume may ask for another criterion, or for fewer motions.
             if line["criterion"] == criterion and line["motion"] in names:
                 self.count(line)
 
-    def record(self, rollout: Rollout, *, wall_s: float) -> tuple[dict[str, Any], bool]:
+    def record(
+        self, rollout: Rollout, *, wall_s: float, is_own: bool = True
+    ) -> tuple[dict[str, Any], bool]:
         """Score one attempt, write its line and count it.
+
+        Args:
+            rollout: of the attempt.
+            wall_s: seconds of the run so far.
+            is_own: it was made here; a model that was found in a file is tried in a
+                child process first.
 
         Returns:
             The line, and whether this attempt is the motion's first that passes.
         """
         name = rollout.motion
+        summary = rollout.summary(self.criterion)
         line = {
-            **rollout.summary(self.criterion),
+            **summary,
             "wall_s": round(wall_s, 3),
             "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
-            "trivial": self.trivial.get(name, []),
+            "trivial": self._trivial(name, summary),
         }
         before = self.conversions.get(name)
         # One lucky draw is not the last word: later passes may still be proven.
-        unproven = before is None or (self.certify and not before["certified"])
-        if line["converted"] and unproven:
-            line.update(self._store(rollout, line["errors"]))
+        is_wanted = (
+            before is None
+            or (self.certify and not before["certified"])
+            or _is_more(line, before)
+        )
+        if line["converted"] and is_wanted:
+            line.update(self._store(rollout, line["errors"], is_own=is_own))
         append_line(self.path, line)
         return line, self.count(line)
+
+    def _trivial(self, name: str, summary: dict[str, Any]) -> list[str]:
+        """Baselines that pass the motion, and whether this attempt moved too little."""
+        ratios = {key: summary[f"{key}_ratio"] for key in ("lift", "path")}
+        unmoved = [UNMOVED] if moves_too_little(ratios) else []
+        return [*self.trivial.get(name, []), *unmoved]
 
     def count(self, line: dict[str, Any]) -> bool:
         """Count a line that is in the file; is it the motion's first that passes?"""
@@ -86,53 +172,83 @@ class Ledger:
         self.attempts[name] = self.attempts.get(name, 0) + 1
         self.last[name] = line["converted"]
         is_first = line["converted"] and name not in self.conversions
-        if is_first:
+        if is_first or (line["converted"] and _is_more(line, self.conversions[name])):
             self.conversions[name] = dict(line)
-        if line.get("verdict") is not None:
-            newest = {key: line[key] for key in ("certified", "verdict")}
+        if line.get("verdict") is not None and name in self.conversions:
+            newest = {key: line.get(key) for key in ("certified", "verdict")}
             self.conversions[name].update(newest)
         return is_first
 
-    def _store(self, rollout: Rollout, errors: dict[str, float]) -> dict[str, Any]:
-        """Store a rollout that passed; what its line says of the file."""
+    def _store(
+        self, rollout: Rollout, errors: dict[str, float], *, is_own: bool
+    ) -> dict[str, Any]:
+        """Store a rollout that passed; what its line says of the files."""
         rollout.errors = json.dumps(errors)
-        path = self.rollouts / f"{rollout.motion}.npz"
+        named = rollout_name(rollout.motion)
+        path = own_file(self.run_dir, named)
+        proof = own_file(self.run_dir, certificate_name(rollout.motion))
+        # A crash may leave a rollout without certificate, never with that of another.
+        proof.unlink(missing_ok=True)
         rollout.save(path)
-        out: dict[str, Any] = {"rollout": f"{ROLLOUTS}/{path.name}"}
+        out: dict[str, Any] = {"rollout": named, "rollout_sha256": hash_content(path)}
         if not self.certify:
             return out
         try:
-            certificate = certify(rollout)
-        except RunError as error:
+            xml = rollout.model_xml
+            model = mujoco.MjModel.from_xml_string(xml) if is_own else None
+            certificate = certify(rollout, model=model)
+        except (FlashdexError, ValueError) as error:
             _LOG.warning("%s: not certified: %s", rollout.motion, error)
             return {**out, "certified": False, "verdict": "not_measured"}
-        certificate.save(path.with_suffix(".certificate.json"))
+        certificate.save(proof)
         verdict = certificate.verdict
-        return {**out, "certified": verdict in PROVEN, "verdict": verdict}
+        return {
+            **out,
+            "certificate_sha256": hash_content(proof),
+            "certified": verdict in PROVEN,
+            "verdict": verdict,
+        }
 
     def adopt(self, *, wall_s: float) -> list[str]:
         """Write the lines of stored rollouts that a crash left without one.
 
-        Each is scored anew from its file alone. One that does not pass stays where it
-        is, without a line; a later conversion replaces it. Returns the motions told of.
+        Each is scored anew from its file alone. One that does not pass, or that is
+        damaged, stays where it is, without a line; a later conversion replaces it.
+        Returns the motions told of.
         """
-        lines = read_lines(self.path)
-        told = {x["rollout"]: x["env_steps"] for x in lines if x.get("rollout")}
+        told = {x["motion"]: x for x in read_ledger(self.path) if x.get("rollout")}
         out = []
         for name in self.names:
-            path = self.rollouts / f"{name}.npz"
-            if not path.is_file():
-                continue
-            with np.load(path, allow_pickle=False) as file:
-                made_at = int(file["env_steps"])
-            # A later pass replaces the file of an unproven one: compare when it was.
-            if told.get(f"{ROLLOUTS}/{path.name}") == made_at:
-                continue
-            rollout = Rollout.load(path)
-            if rollout.score()[self.criterion].is_passed:
-                self.record(rollout, wall_s=wall_s)
+            path = own_file(self.run_dir, rollout_name(name))
+            if path.is_file() and self._adopt(name, path, told.get(name), wall_s):
                 out.append(name)
         return out
+
+    def _adopt(
+        self, name: str, path: Path, line: dict[str, Any] | None, wall_s: float
+    ) -> bool:
+        """Write the line of one stored rollout, unless it has one."""
+        if line is not None and line.get("rollout_sha256") == hash_content(path):
+            return False
+        try:
+            rollout = Rollout.load(path)
+            if rollout.motion != name:
+                raise RunError(f"{path}: is the rollout of '{rollout.motion}'.")
+            # A later pass replaces the file of an unproven one: compare when it was.
+            if line is not None and line["env_steps"] == rollout.env_steps:
+                if "rollout_sha256" in line:
+                    raise RunError(f"{path}: was changed after its line was written.")
+                return False
+            if not rollout.score()[self.criterion].is_passed:
+                return False
+            for finding in RolloutCheck(rollout, path.name, None).run():
+                if finding.is_fault:
+                    raise RunError(f"{finding}.")
+        except FlashdexError as error:
+            _LOG.warning("%s It is left as it is; 'flashdex verify' tells more", error)
+            return False
+        self.record(rollout, wall_s=wall_s, is_own=False)
+        return True
 
     @property
     def num_bytes(self) -> int:
@@ -141,9 +257,11 @@ class Ledger:
 
     @property
     def note(self) -> str:
-        """What was achieved, in a few words."""
-        text = f"{self.num_converted}/{len(self.names)} converted"
-        return f"{text}, {self.num_certified} certified" if self.conversions else text
+        """What was achieved, in a few words: what is not trivial first."""
+        text = f"{self.num_converted} of {len(self.names)} converted"
+        if self.num_converted:
+            text += f", {self.num_certified} certified"
+        return f"{text}, and {self.num_trivial} trivial" if self.num_trivial else text
 
     @property
     def num_attempts(self) -> int:
@@ -151,28 +269,44 @@ class Ledger:
         return sum(self.attempts.values())
 
     @property
-    def num_converted(self) -> int:
-        """Motions with at least one passing attempt."""
+    def num_passed(self) -> int:
+        """Motions with at least one passing attempt, trivial ones too."""
         return len(self.conversions)
 
     @property
+    def _earned(self) -> list[dict[str, Any]]:
+        return [c for c in self.conversions.values() if not is_trivial(c)]
+
+    @property
+    def num_converted(self) -> int:
+        """Motions with a passing attempt that is not trivial."""
+        return len(self._earned)
+
+    @property
+    def num_trivial(self) -> int:
+        """Motions whose passing attempt is trivial."""
+        return self.num_passed - self.num_converted
+
+    @property
     def num_certified(self) -> int:
-        """Converted motions whose certificate holds."""
-        return sum(bool(c["certified"]) for c in self.conversions.values())
+        """Converted motions, not trivial, whose certificate holds."""
+        return sum(bool(c["certified"]) for c in self._earned)
 
     def metrics(self, hours: float) -> dict[str, float]:
         """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
         passing = sum(self.last.get(n, False) for n in self.names)
-        robust = sum(c.get("verdict") == "robust" for c in self.conversions.values())
+        every = self.conversions.values()
         out = {
-            "convert/cumulative": float(self.num_converted),
-            "convert/rate": self.num_converted / total,
+            "convert/nontrivial": float(self.num_converted),
+            "convert/trivial": float(self.num_trivial),
+            "convert/cumulative": float(self.num_passed),
+            "convert/rate": self.num_passed / total,
             "convert/last": passing / total,
-            "convert/certified": float(self.num_certified),
-            "convert/robust": float(robust),
+            "convert/certified": float(sum(bool(c["certified"]) for c in every)),
+            "convert/robust": float(sum(c.get("verdict") == "robust" for c in every)),
             "convert/attempts": float(self.num_attempts),
         }
         if hours > 0:
-            out["convert/per_hour"] = self.num_converted / hours
+            out["convert/per_hour"] = self.num_passed / hours
         return out

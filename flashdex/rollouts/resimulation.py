@@ -21,6 +21,7 @@ from flashdex.metrics.criteria import score
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import TrackingErrors
 from flashdex.rollouts.rollout import Rollout
+from flashdex.system.mjcf import compile_mjcf
 
 # a proof may cost more than training: solver effort of at least these (method, sec. 17)
 MIN_ITERATIONS, MIN_LS_ITERATIONS = 100, 200
@@ -60,13 +61,18 @@ class Replay:
     wrench_max: float  # largest applied force or torque seen, N or N m
 
 
-def load_simulation(rollout: Rollout) -> Simulation:
-    """Compile the model of a rollout and find its parts; RunError when absent."""
+def load_simulation(
+    rollout: Rollout, given: mujoco.MjModel | None = None
+) -> Simulation:
+    """Find the parts of a rollout in its model, which is compiled where None is given.
+
+    Raises:
+        FlashdexError: the model is not allowed or does not compile, or a part is not
+            in it.
+    """
     motion = rollout.motion
-    try:
-        model = mujoco.MjModel.from_xml_string(rollout.model_xml)
-    except ValueError as error:
-        raise RunError(f"{motion}: model_xml does not compile: {error}") from None
+    own = given or compile_mjcf(rollout.model_xml, where=motion)
+    model: mujoco.MjModel = copy.deepcopy(own)
     model.opt.iterations = max(model.opt.iterations, MIN_ITERATIONS)
     model.opt.ls_iterations = max(model.opt.ls_iterations, MIN_LS_ITERATIONS)
     # a diverged state must stay visible instead of being reset
@@ -74,6 +80,8 @@ def load_simulation(rollout: Rollout) -> Simulation:
     _check_sizes(model, rollout)
     adr = np.asarray(rollout.object_qpos_adr, dtype=np.int64)
     wrists = json.loads(rollout.wrist_bodies or "[null, null]")
+    if len(wrists) != 2 or not all(w is None or isinstance(w, str) for w in wrists):
+        raise RunError(f"{motion}: wrist_bodies must hold two names, or null.")
     active = rollout.hand_active.astype(bool)
     named = [n if on else None for n, on in zip(wrists, active, strict=True)]
     return Simulation(
@@ -92,7 +100,12 @@ def load_simulation(rollout: Rollout) -> Simulation:
 def _joint_bodies(model: mujoco.MjModel, rollout: Rollout) -> np.ndarray:
     links = json.loads(rollout.joint_bodies)
     count = rollout.joints.shape[2]
-    if len(links) != 2 or any(len(side) not in (0, count) for side in links):
+    if len(links) != 2 or not all(
+        isinstance(side, list)
+        and len(side) in (0, count)
+        and all(isinstance(name, str) for name in side)
+        for side in links
+    ):
         raise RunError(
             f"{rollout.motion}: joint_bodies must hold two lists (left, right) of "
             f"{count} body names, one a row of joints, or empty lists."
@@ -176,13 +189,13 @@ def resimulate(sim: Simulation, *, monitor: StepMonitor | None = None) -> Replay
         if name.startswith("mjWARN_")
     }
     overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
-    states = {**_tracked_points(sim, qpos), **_object_poses(sim, qpos)}
+    states = {**tracked_points(sim, qpos), **object_poses(sim, qpos)}
     errors = rollout.errors_of(states, overflow=overflow)
     verdicts = score(errors, grace=rollout.grace)
     return Replay(qpos, errors, verdicts, warnings, nan_count, wrench_max)
 
 
-def _tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+def tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
     """Fingertips, links and wrists by forward kinematics, (T, 2, ..., 3)."""
     data = mujoco.MjData(sim.model)
     parts = {
@@ -207,7 +220,8 @@ def _tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray |
     return found
 
 
-def _object_poses(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+def object_poses(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
+    """Poses of the objects in flat states, (T, O, 3) and (T, O, 4), NaN where none."""
     pose = np.full((len(qpos), len(sim.object_adr), 7), np.nan)
     for slot, adr in enumerate(sim.object_adr):
         if adr >= 0:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -16,14 +15,27 @@ from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.keys import SIDES
-from flashdex.metrics.criteria import score
+from flashdex.metrics.criteria import score, worst_movement
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import TrackingErrors, compute_tracking_errors
+from flashdex.system.archives import read_npz
 from flashdex.system.files import open_atomic
+from flashdex.system.names import check_name
 
 ROLLOUT_SCHEMA = 1
+MAX_BYTES = 256 << 20  # of the arrays of a file; a minute of two hands has 20 MB
+_WHOLE = ("hand_active", "hand_object", "object_qpos_adr", "object_qvel_adr")
+MAX_FPS, MAX_DECIMATION = 1000, 1000
+# JSON fields and what they hold
+_JSON: dict[str, type] = {
+    "joint_bodies": list,
+    "errors": dict,
+    "versions": dict,
+    "provenance": dict,
+    "wrist_bodies": list,
+}
 
 
 @dataclass
@@ -139,12 +151,17 @@ class Rollout:
         """What the ledger's line says of this attempt, scored by ``criterion``."""
         verdicts = self.score(completed=self.completed)
         verdict = verdicts[criterion]
+        ratios = worst_movement(self.tracking_errors())
         return {
             "motion": self.motion,
             "converted": verdict.is_passed,
             "certified": None,
             "criterion": criterion,
             "errors": {k: round(v, 6) for k, v in verdict.values.items()},
+            **{
+                f"{key}_ratio": None if ratio is None else round(ratio, 4)
+                for key, ratio in ratios.items()
+            },
             "passed": [name for name, v in verdicts.items() if v.is_passed],
             "completed": self.completed,
             "hands": [SIDES[hand] for hand in np.flatnonzero(self.hand_active)],
@@ -160,20 +177,23 @@ class Rollout:
             value = getattr(self, key)
             if get_origin(hint) is Annotated and value is not None:
                 _check_shape(key, value, hint.__metadata__[0], sizes, where)
-        for key in ("joint_bodies", "errors", "versions", "provenance", "wrist_bodies"):
-            text = getattr(self, key)
-            try:
-                if text or key != "wrist_bodies":  # which may be empty
-                    json.loads(text)
-            except json.JSONDecodeError as error:
-                raise RunError(f"{where}: {key} is not JSON ({error}).") from error
+        for key, kind in _JSON.items():
+            if getattr(self, key) or key != "wrist_bodies":  # which may be empty
+                _check_json(key, getattr(self, key), kind, where)
+        check_name(self.motion, what="motion", where=where)
+        check_name(self.hand, what="hand", where=where)
+        if not (0 < self.fps <= MAX_FPS and 1 <= self.decimation <= MAX_DECIMATION):
+            raise RunError(
+                f"{where}: {self.fps:g} control steps a second of {self.decimation} "
+                f"substeps. Allowed: up to {MAX_FPS} and {MAX_DECIMATION}."
+            )
         if self.model_sha256 != _sha256(self.model_xml):
             raise RunError(
                 f"{where}: model_sha256 does not match model_xml: the model was "
                 "changed after the rollout was stored. Store the rollout again."
             )
-        slots = self.hand_object[self.hand_active.astype(bool)]
-        if (slots >= sizes["O"]).any():
+        slots = self.hand_object
+        if (slots >= max(1, sizes["O"])).any():
             raise RunError(
                 f"{where}: hand_object {slots.tolist()} names a slot beyond the "
                 f"{sizes['O']} objects of object_pos. Allowed: -1 to {sizes['O'] - 1}."
@@ -189,6 +209,20 @@ class Rollout:
             np.savez_compressed(file, schema=ROLLOUT_SCHEMA, **arrays)
         return path
 
+    @property
+    def content_sha256(self) -> str:
+        """SHA-256 of every field, however a file packs them."""
+        found = hashlib.sha256()
+        for name in sorted(f.name for f in fields(self)):
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                kind = value.dtype.newbyteorder("<")
+                found.update(f"{name} {kind.str} {value.shape}".encode())
+                found.update(np.ascontiguousarray(value, kind).tobytes())
+            else:
+                found.update(f"{name} {value!r} ".encode())
+        return found.hexdigest()
+
     @classmethod
     def load(cls, path: str | Path) -> Rollout:
         """Read and check a file; every fault is a RunError that names the key."""
@@ -200,14 +234,20 @@ class Rollout:
                 f"{path}: missing keys {', '.join(absent)}. A rollout holds "
                 f"{', '.join(sorted(required))}. Store the rollout again."
             )
-        values: dict[str, Any] = {
-            key: data[key] if get_origin(hint) is Annotated else hint(data[key])
+        foreign = sorted(data.keys() - {"schema", *_hints()})
+        if foreign:
+            raise RunError(
+                f"{path}: holds {foreign[0]!a}, which no rollout does. Store the "
+                "rollout again."
+            )
+        values = {
+            key: _field(key, data[key], hint, path)
             for key, hint in _hints().items()
             if key in data
         }
         try:
             return cls(**values)
-        except RunError as error:
+        except FlashdexError as error:
             raise RunError(str(error).replace("rollout:", f"{path}:", 1)) from None
 
 
@@ -235,21 +275,43 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise RunError(f"{path}: no such file. Stored rollouts end in .npz.")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {key: file[key] for key in file.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        data = read_npz(path, limit=MAX_BYTES)
+    except (ValueError, OSError) as error:
         raise RunError(
             f"{path}: not a readable rollout ({error}). It must be an .npz of plain "
-            "arrays, without pickled objects."
+            "arrays, without pickled objects, of at most 256 MiB."
         ) from error
     if "schema" not in data:
         raise RunError(f"{path}: missing key schema; this is not a flashdex rollout.")
-    if int(data["schema"]) != ROLLOUT_SCHEMA:
+    schema = _field("schema", data["schema"], int, path)
+    if schema != ROLLOUT_SCHEMA:
         raise RunError(
-            f"{path}: schema {int(data['schema'])}, this version reads "
+            f"{path}: schema {schema}, this version reads "
             f"{ROLLOUT_SCHEMA}. Store the rollout again or use the matching version."
         )
     return data
+
+
+def _field(key: str, value: np.ndarray, hint: Any, path: str | Path) -> Any:
+    """An array of numbers as it is, or one text or number of it."""
+    is_array = get_origin(hint) is Annotated
+    kinds = {str: "U", int: "iu", float: "fiu"}.get(hint, "fiub")
+    kinds = "iub" if key in _WHOLE else kinds  # these index others
+    if value.dtype.kind not in kinds or (not is_array and value.shape != ()):
+        raise RunError(
+            f"{path}: {key} holds {value.dtype} {value.shape}, which is not what a "
+            "rollout has there. Store the rollout again."
+        )
+    return value if is_array else hint(value)
+
+
+def _check_json(key: str, text: str, kind: type, where: str) -> None:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{where}: {key} is not JSON ({error}).") from error
+    if not isinstance(found, kind):
+        raise RunError(f"{where}: {key} is JSON, but no {kind.__name__}.")
 
 
 def _check_shape(

@@ -35,9 +35,10 @@ def check_name(name: Any, *, what: str, where: str = "") -> str:
         shown = ascii(name)
         shown = shown if len(shown) < 80 else f"{shown[:80]}..."
         place = f"{where}: " if where else ""
+        article = "an" if what[0] in "aeiou" else "a"
         raise FlashdexError(
-            f"{place}{shown} is no name of a {what}: {fault}. A name is one line of "
-            f"printable text of at most {NAME_BYTES} bytes, without / and \\."
+            f"{place}{shown} is no name of {article} {what}: {fault}. A name is one "
+            f"line of printable text of at most {NAME_BYTES} bytes, without / and \\."
         )
     return name
 
@@ -51,15 +52,27 @@ def check_names(names: Iterable[Any], *, what: str, where: str = "") -> list[str
     checked = [check_name(name, what=what, where=where) for name in names]
     seen: dict[str, str] = {}
     for name in checked:
-        # file systems that ignore case would take two for one
-        other = seen.setdefault(file_stem(name).casefold(), name)
-        if other is not name:
+        key = file_stem(name).casefold()  # some file systems ignore case
+        if key in seen:
             place = f"{where}: " if where else ""
             raise FlashdexError(
-                f"{place}two {what}s are called {other!a} and {name!a}; "
-                "their files would be the same. Rename one."
+                f"{place}two {what}s are called {seen[key]!a} and {name!a}; their "
+                "files would be the same. Rename one."
             )
+        seen[key] = name
     return checked
+
+
+def plain_name(name: str, *, limit: int = NAME_BYTES) -> str:
+    """The nearest name: what one may not hold is "_", what is too long is cut.
+
+    Example:
+        >>> plain_name("s1/mug"), plain_name("")
+        ('s1_mug', '_')
+    """
+    text = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
+    text = text.encode("utf-8")[:limit].decode("utf-8", errors="ignore")
+    return text if not _fault(text) else f"_{text.strip('. ')}"
 
 
 def _fault(name: Any) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +15,14 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from flashdex.envs.scene.scene import SceneLayout
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import frozen_object
+from flashdex.motions.library_format import hash_json
 from flashdex.rollouts.build import grace_steps
-from flashdex.system.files import write_atomic
+from flashdex.system.files import open_plain, write_atomic
 from flashdex.training.build import RunBuilder
 from flashdex.training.evaluator import roll_all
 
@@ -27,7 +32,7 @@ class Baselines:
     """Scores of each baseline on each motion.
 
     Attributes:
-        rows: baseline -> motion -> {"passed": criteria, "errors": ..., "why": ...}.
+        rows: baseline -> motion -> {"passed": criteria, "state": ..., "errors": ...}.
     """
 
     rows: dict[str, dict[str, dict[str, Any]]]
@@ -55,32 +60,96 @@ def follow_reference(env: TrackingEnv) -> Tensor:
 
 
 BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}
+FROZEN = "frozen_object"
+# of a row: the hash of its scores and of what they depend on
+SEAL = "sha256"
+# of the environment: what a baseline's one episode from frame 0 never meets
+NO_MATTER = {"compile", "num_envs", "rsi", "sampler", "attempt_share", "assist"}
+NO_MATTER |= {"reset_noise", "reset_hold_s", "reset_hold_stiffness"}
+NO_MATTER |= {"transforms", "rewards", "terminations", "reference_offset"}
+MAX_BYTES = 256 << 20  # of the file of a run
+_LOG = logging.getLogger(__name__)
 
 
 def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
-    """Roll and score all baselines on all motions; reuse the file of this run."""
-    if path is not None and path.is_file():
-        return Baselines(json.loads(path.read_text(encoding="utf-8")))
+    """Roll and score all baselines on all motions.
+
+    What the file of this run knows is reused, motion by motion: of the same content, by
+    the same physics. A row that was edited is scored again.
+    """
+    known = {} if path is None else _read_known(path)
+    inputs = _inputs(builder)
     joints = builder.bank.num_joints
 
     def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
         return torch.zeros(env.num_envs, 2, joints, device=env.device)
 
     rows: dict[str, dict[str, dict[str, Any]]] = {}
-    for name, target in BASELINES.items():
-        rollouts = roll_all(builder, idle, target=target)
-        rows[name] = {r.motion: _row(builder, r.score()) for r in rollouts}
-    rows["frozen_object"] = _score_frozen(builder)
-    if path is not None:
+    for name in (*BASELINES, FROZEN):
+        old = known.get(name, {})
+        mine = {
+            motion: old[motion]
+            for motion, made_of in inputs.items()
+            if _is_sealed(old.get(motion), made_of)
+        }
+        todo = [row for row, motion in enumerate(inputs) if motion not in mine]
+        if name == FROZEN:
+            mine |= _score_frozen(builder, todo)
+        else:
+            for rollout in roll_all(builder, idle, target=BASELINES[name], rows=todo):
+                mine[rollout.motion] = _row(builder, rollout.score())
+        rows[name] = {m: _sealed(mine[m], made_of) for m, made_of in inputs.items()}
+    if path is not None and rows != known:
         write_atomic(path, json.dumps(rows, indent=1))
     return Baselines(rows)
 
 
-def _score_frozen(builder: RunBuilder) -> dict[str, dict[str, Any]]:
+def _read_known(path: Path) -> dict[str, Any]:
+    """Scores of an earlier session; nothing where they cannot be read."""
+    try:
+        with open_plain(path) as file:
+            known = json.loads(file.read(MAX_BYTES).decode("utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        _LOG.warning("%s: cannot be read (%s); baselines are scored again", path, error)
+        return {}
+    tables = known.items() if isinstance(known, dict) else ()
+    return {name: table for name, table in tables if isinstance(table, dict)}
+
+
+def _inputs(builder: RunBuilder) -> dict[str, str]:
+    """Hash of all that the scores of a motion depend on, by motion."""
+    recipe, library = builder.recipe, builder.library
+    physics, env = dataclasses.asdict(recipe.physics), dataclasses.asdict(recipe.env)
+    shared = {
+        "hand": recipe.hand,
+        "physics": {k: v for k, v in physics.items() if k != "num_threads"},
+        "env": {k: v for k, v in env.items() if k not in NO_MATTER},
+        "criterion": recipe.train.criterion,
+        "layout": dataclasses.asdict(SceneLayout.of(library)),
+        "mujoco": version("mujoco"),
+    }
+    return {
+        name: hash_json([shared, library.motion_hash(row)])
+        for row, name in enumerate(builder.bank.names)
+    }
+
+
+def _sealed(row: dict[str, Any], made_of: str) -> dict[str, Any]:
+    scores = {key: value for key, value in row.items() if key != SEAL}
+    return {**scores, SEAL: hash_json([made_of, scores])}
+
+
+def _is_sealed(row: Any, made_of: str) -> bool:
+    return isinstance(row, dict) and row == _sealed(row, made_of)
+
+
+def _score_frozen(builder: RunBuilder, rows: list[int]) -> dict[str, dict[str, Any]]:
     """``frozen_object``: objects stay at their first reference pose."""
     bank = builder.bank_on(torch.device("cpu"))
     out: dict[str, dict[str, Any]] = {}
-    for row, name in enumerate(bank.names):
+    for row in rows:
         frames = torch.arange(int(bank.length[row]))
         ref = bank.at(torch.full_like(frames, row), frames)
         slots = torch.where(bank.has_object[row], bank.hand_slot[row], -1)
@@ -91,7 +160,8 @@ def _score_frozen(builder: RunBuilder) -> dict[str, dict[str, Any]]:
             hand_object=slots.tolist(),
             fps=bank.fps,
         )
-        out[name] = _row(builder, score(errors, grace=grace_steps(bank.fps)))
+        verdicts = score(errors, grace=grace_steps(bank.fps))
+        out[bank.names[row]] = _row(builder, verdicts)
     return out
 
 

@@ -9,12 +9,11 @@ import json
 import logging
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 from flashdex import keys
@@ -22,20 +21,22 @@ from flashdex.algorithms import find_algorithm
 from flashdex.algorithms.base import Learner, TaskSpec
 from flashdex.datasets.source import SourceOptions
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
-from flashdex.envs.reference import ReferenceBank
-from flashdex.envs.scene.scene import Scene
+from flashdex.envs.reference import ReferenceBank, stack_hands
+from flashdex.envs.scene.scene import Scene, build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.envs.transforms.assembly import make_transforms
 from flashdex.errors import DemoError, FlashdexError, LibraryError
-from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
 from flashdex.hands.spec import HandSpec, load_hand
 from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import MANIFEST, OldLibraryError
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
+from flashdex.rollouts.truth import leading_time, settings_of
 from flashdex.system.machine import versions
 
+JOINT_SLACK = 0.5  # m or rad beyond a hand's range that a reference may ask for
 _LOG = logging.getLogger(__name__)
 
 
@@ -55,8 +56,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
         )
     folder = Path("libraries") / library_name(recipe)
     order = _order(recipe)
-    if (folder / "manifest.json").is_file():
-        library = MotionLibrary.load(folder)
+    if (library := _load_current(folder)) is not None:
         try:
             if library.manifest.get("inputs") == hash_inputs(order):
                 return library
@@ -66,6 +66,17 @@ def load_library(recipe: Recipe) -> MotionLibrary:
         _LOG.info("the recordings have changed since %s was prepared", folder)
     _LOG.info("preparing motions from '%s' in %s", motions.source, folder)
     return run_order(order, folder)
+
+
+def _load_current(folder: Path) -> MotionLibrary | None:
+    """An automatic library; None where there is none of this version."""
+    if not (folder / MANIFEST).is_file():
+        return None
+    try:
+        return MotionLibrary.load(folder)
+    except OldLibraryError as error:
+        _LOG.info("%s", error)
+        return None
 
 
 def _order(recipe: Recipe) -> Order:
@@ -143,7 +154,32 @@ def _take(library: MotionLibrary, rows: list[int]) -> MotionLibrary:
         motions=motions,
         objects=library.objects,
         manifest=manifest,
+        content_hash=library.content_hash,
     )
+
+
+def _check_joints(library: MotionLibrary, hands: dict[keys.Side, HandSpec]) -> None:
+    """A hand of the library's name may have changed since, or be another's."""
+    found = library.frames["joint_pos"].shape[-1]
+    ranges = stack_hands(hands, "joint_range")
+    if found != ranges.shape[1]:
+        raise LibraryError(
+            f"{library.path}: has {found} joints of '{library.hand}', the hand has "
+            f"{ranges.shape[1]}. Prepare it again for this hand."
+        )
+    low, high = ranges[..., 0] - JOINT_SLACK, ranges[..., 1] + JOINT_SLACK
+    for row, name in enumerate(library.names):
+        start, length = (int(library.motions[k][row]) for k in ("start", "length"))
+        pos = library.frames["joint_pos"][start : start + length]
+        outside = ((pos < low) | (pos > high)).any(0)
+        outside &= library.motions["hand_active"][row].unsqueeze(-1)
+        if outside.any():
+            side, joint = outside.nonzero()[0].tolist()
+            joint_name = hands[keys.SIDES[side]].joint_names[joint]
+            raise LibraryError(
+                f"{library.path}: motion {name!a} bends '{joint_name}' beyond its "
+                "range: it is of another hand. Prepare it again for this one."
+            )
 
 
 @dataclass(frozen=True)
@@ -171,6 +207,7 @@ class RunBuilder:
                 f"{library.path}: prepared for hand '{library.hand}', the recipe asks "
                 f"for '{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
             )
+        _check_joints(library, hands)
         step_dt = recipe.physics.timestep * recipe.physics.decimation
         if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):
             decimation = round(1 / (library.fps * recipe.physics.timestep))
@@ -184,6 +221,11 @@ class RunBuilder:
             check_engine(library, recipe.physics)
             device = engine_device(recipe.physics)
         return cls(recipe, library, hands, ReferenceBank(library, hands).to(device))
+
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """Scenes of all motions; environments and scoring share them."""
+        return build_scenes(self.library, self.hands, self.recipe.physics)
 
     @property
     def step_dt(self) -> float:
@@ -200,14 +242,16 @@ class RunBuilder:
         """Build physics and environment, as the recipe says where None."""
         recipe = self.recipe
         count = recipe.env.num_envs if num_envs is None else num_envs
-        physics = make_physics(self.library, self.hands, recipe.physics, count)
+        physics = make_physics(
+            self.library, self.hands, recipe.physics, count, self.scenes
+        )
         return TrackingEnv(
             physics,
             self.bank,
             self.hands,
             recipe.env,
             step_dt=self.step_dt,
-            lead_s=self._wrist_lead() if recipe.env.wrist_lead else None,
+            lead_s=leading_time(self.hands, recipe),
             seed=recipe.seed if seed is None else seed,
             evaluation=evaluation,
         )
@@ -223,7 +267,7 @@ class RunBuilder:
         scenes: list[Scene],
         *,
         made_by: dict[str, Any] | None = None,
-        provenance: dict[str, str] | None = None,
+        provenance: dict[str, Any] | None = None,
     ) -> RolloutBuilder:
         """Build what turns episodes into rollouts."""
         recipe, device = self.recipe, self.bank.table.device
@@ -235,16 +279,9 @@ class RunBuilder:
             criterion=recipe.train.criterion,
             seed=recipe.seed,
             made_by=made_by or versions(recipe.physics.engine, device),
-            provenance=provenance,
+            provenance={**(provenance or {}), "physics": settings_of(recipe)},
+            motion_hash=self.library.motion_hash,
         )
-
-    def _wrist_lead(self) -> Tensor:
-        """Lag of the wrist servos, s, (2, J); zero for the fingers."""
-        gains = self.recipe.physics.gains
-        lags = [servo_lag(self.hands[s].gains[gains]) for s in keys.SIDES]
-        lead = torch.tensor(np.stack(lags), dtype=torch.float32)
-        lead[:, NUM_WRIST_JOINTS:] = 0.0
-        return lead
 
     def make_transforms(self, bank: ReferenceBank) -> list[Transform]:
         """Build the observation transforms of the recipe on the bank's device."""

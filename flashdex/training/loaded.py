@@ -14,14 +14,34 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from flashdex import keys
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RunError
+from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
-from flashdex.rollouts.ledger import CONVERSIONS
+from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
 from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.truth import Truth
 from flashdex.system.files import own_file
-from flashdex.system.jsonl import read_lines
 from flashdex.system.run_files import read_metrics
+from flashdex.training.build import RunBuilder
+from flashdex.training.memory.stand_in import find_library
 from flashdex.training.run_dir import load_learner, load_run_recipe
+
+
+def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
+    """Recipe and library of a run, to verify its rollouts against.
+
+    Nothing is prepared.
+
+    Returns:
+        None, and why, where the library is not at hand.
+    """
+    try:
+        recipe = expect_kind(load_run_recipe(Path(run_dir)), Recipe, where=str(run_dir))
+        if find_library(recipe) is None:
+            return None, "the library that recipe.yaml names is not here"
+        builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
+    except FlashdexError as error:
+        return None, str(error)
+    return Truth(recipe, builder.library, builder.hands, builder.bank), ""
 
 
 class RunPolicy(TensorDictModuleBase):
@@ -71,7 +91,7 @@ class Run:
     @cached_property
     def attempts(self) -> list[dict[str, Any]]:
         """Lines of ``conversions.jsonl``, one an attempt."""
-        return read_lines(own_file(self.path, CONVERSIONS))
+        return read_ledger(self.path / CONVERSIONS)
 
     @cached_property
     def metrics(self) -> list[dict[str, Any]]:
@@ -92,7 +112,7 @@ class Run:
         if motion not in self.converted:
             known = ", ".join(self.converted) or "none"
             raise RunError(f"{self.path}: no rollout of '{motion}'. Stored: {known}.")
-        return Rollout.load(own_file(self.path, self.converted[motion]["rollout"]))
+        return Rollout.load(own_file(self.path, rollout_name(motion)))
 
     def policy(self) -> RunPolicy:
         """The newest policy."""

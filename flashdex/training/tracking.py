@@ -18,7 +18,6 @@ from torch import Tensor
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.envs.mdp.assist import AssistEpoch
-from flashdex.envs.scene.scene import build_scenes
 from flashdex.envs.tracking import TrackingEnv
 from flashdex.errors import RunError
 from flashdex.modules.layers import restore_generator
@@ -27,7 +26,6 @@ from flashdex.replay.buffer import check_pinning
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, ScorerSpec
-from flashdex.system.files import remove_own
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.machine import versions
 from flashdex.system.run_files import BASELINES, MOTIONS
@@ -84,11 +82,10 @@ class TrackingTask(Task):
     @cached_property
     def provenance(self) -> dict[str, str]:
         """Where a rollout comes from, apart from the versions stored with it."""
-        manifest = (self.builder.library.path / "manifest.json").read_bytes()
         recipe = dump_recipe(self.recipe).encode()
         return {
             "recipe_sha256": hashlib.sha256(recipe).hexdigest(),
-            "library_sha256": hashlib.sha256(manifest).hexdigest(),
+            "library_sha256": self.builder.library.content_hash,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
 
@@ -126,10 +123,7 @@ class TrackingTask(Task):
     def _contents(self) -> dict[str, str]:
         """Hash of the content of each motion, by name."""
         library = self.builder.library
-        hash_of = getattr(library, "motion_hash", None)
-        if hash_of is None:
-            return {}
-        return {name: hash_of(row) for row, name in enumerate(library.names)}
+        return {n: library.motion_hash(row) for row, n in enumerate(library.names)}
 
     def _remember_motions(self, run_dir: Path) -> None:
         known = read_object(run_dir, MOTIONS).get("motions", {})
@@ -138,12 +132,10 @@ class TrackingTask(Task):
             write_object(everything, run_dir, MOTIONS)
 
     def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
-        """Score the baselines, anew where the recipe changed, and open the ledger."""
+        """Score the baselines, what is new of them, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)
         self._remember_motions(run_dir)
-        if changed:
-            remove_own(run_dir, BASELINES)
         baselines = score_baselines(self.builder, run_dir / BASELINES)
         self.ledger = open_ledger(
             self.builder,
@@ -233,7 +225,7 @@ class TrackingTask(Task):
 
     def end_reason(self) -> str:
         """``all converted``, when that ends the run."""
-        everything = self.ledger.num_converted == len(self.ledger.names)
+        everything = self.ledger.num_passed == len(self.ledger.names)
         stops = self.recipe.train.stop_when_all_converted
         return "all converted" if stops and everything else ""
 
@@ -317,9 +309,8 @@ def open_ledger(
 def make_inline_scorer(spec: ScorerSpec) -> InlineScorer:
     """Build the scorer of the scoring process."""
     builder = RunBuilder.from_recipe(spec.recipe, device=torch.device("cpu"))
-    scenes = build_scenes(builder.library, builder.hands, spec.recipe.physics)
     rollouts = builder.rollout_builder(
-        scenes, made_by=spec.made_by, provenance=spec.provenance
+        builder.scenes, made_by=spec.made_by, provenance=spec.provenance
     )
     ledger = open_ledger(builder, spec.run_dir, spec.trivial, on_gpu=spec.on_gpu)
     return InlineScorer(ledger, rollouts)

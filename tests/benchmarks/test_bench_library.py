@@ -14,7 +14,7 @@ from benchmarks.common.library import (
     recut_library,
 )
 from flashdex.errors import FlashdexError
-from flashdex.motions.library import FRAME_KEYS
+from flashdex.motions.library_format import FRAME_KEYS
 
 
 def ball(points=60):

@@ -221,7 +221,7 @@ def test_models_may_lie_apart(scene, tmp_path):
         ({"mano_right_joints": np.zeros((FRAMES, 21, 3))}, r"expected \(T, 20, 3\)"),
         ({"mano_right_wrist_pos": None}, r"expected \(T, 20, 3\) and \(T, 3\)"),
         ({"obj_right_pose": np.zeros((FRAMES, 7))}, r"expected \(T, 4, 4\)"),
-        ({"obj_right_id": np.array("../secret")}, "plain name"),
+        ({"obj_right_id": np.array("../secret")}, "it is a path"),
         ({"obj_right_pose": None, "obj_left_id": None}, "no object"),
         ({"mano_right_joint_names": np.array(["a"] * 20)}, "mano_right_joint_names"),
         (

@@ -24,7 +24,7 @@ from flashdex.motions.library_writer import LibraryWriter, _unique_names
 from flashdex.motions.pipeline import cache as motion_cache
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.workers import Job, run_job
-from flashdex.objects import meshes
+from flashdex.objects import mesh_files
 from flashdex.objects.asset import ObjectSettings, make_object
 from flashdex.objects.meshes import load_mesh
 
@@ -127,7 +127,7 @@ def test_scene_that_repeats_a_mesh_too_often_is_refused(tmp_path, monkeypatch):
     size = struct.pack("<II", 20 + len(text) + len(rest), len(text))
     file.write_bytes(b"glTF\2\0\0\0" + size + b"JSON" + text + rest)
     assert len(load_mesh(file).faces) == 120
-    monkeypatch.setattr(meshes, "MAX_FACES", 119)
+    monkeypatch.setattr(mesh_files, "MAX_FACES", 119)
     with pytest.raises(MeshError, match="120 triangles; at most 119"):
         load_mesh(file)
 

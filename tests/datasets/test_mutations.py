@@ -6,6 +6,7 @@ what the checks let through) except in the last test, which prepares libraries.
 
 import csv
 import os
+import re
 import shutil
 import signal
 import zlib
@@ -254,12 +255,26 @@ def test_library_holds_only_the_good_ones(tmp_path):
     assert all(ours), written
 
 
+@pytest.mark.parametrize("name", ["../../../climbed", "a/b", "..", "a\nb", "x" * 300])
+def test_objects_whose_name_is_a_path_are_rejected(tmp_path, shared, name):
+    write(tmp_path / "in", "grab")
+    file = tmp_path / "in" / "grab" / "s1" / "mug_drink_1.npz"
+    with np.load(file, allow_pickle=True) as stored:
+        data = dict(stored)
+    np.savez(file, **data | {"obj_name": np.array(name, dtype=object)})
+    options = SourceOptions(path=tmp_path / "in", mano=shared / "mano")
+    (listed,) = list_recordings("grab", options)
+    (item,) = prepare_recording(listed, MotionSettings(cache_dir=tmp_path / "cache"))
+    assert item.record is None
+    assert re.search("E_KEYS: .* is no name of an? object: it", item.row["reason"])
+
+
 def test_objects_of_any_name_stay_inside_the_library(tmp_path, shared):
     write(tmp_path / "in", "grab")
     file = tmp_path / "in" / "grab" / "s1" / "mug_drink_1.npz"
     with np.load(file, allow_pickle=True) as stored:
         data = dict(stored)
-    data["obj_name"] = np.array("../../../climbed", dtype=object)
+    data["obj_name"] = np.array("...climbed: <ü> |*?", dtype=object)
     data["motion_intent"] = np.array("=1+2", dtype=object)
     np.savez(file, **data)
     before = sorted(tmp_path.rglob("*"))
@@ -272,9 +287,10 @@ def test_objects_of_any_name_stay_inside_the_library(tmp_path, shared):
     meshes = [
         p for o in library.manifest["objects"] for p in (o["visual"], *o["parts"])
     ]
+    data = library.path / library.manifest["data"]
     root = os.path.realpath(library.path)
-    assert all(os.path.realpath(library.path / m).startswith(root) for m in meshes)
-    assert all((library.path / m).is_file() for m in meshes)
+    assert all(os.path.realpath(data / m).startswith(root) for m in meshes)
+    assert all((data / m).is_file() for m in meshes)
     assert "'=1+2" in (library.path / "report.csv").read_text()
     written = {p for p in tmp_path.rglob("*") if p not in before}
     ours = [p.relative_to(tmp_path).parts[0] in ("out", "cache") for p in written]

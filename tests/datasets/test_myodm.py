@@ -50,8 +50,18 @@ def test_complete_folder_is_not_fetched_again(folder, monkeypatch):
     assert fetch("myodm", folder) == folder
 
 
-def test_interrupted_folder_is_refused_and_kept(folder, wheel):
-    (folder / "meshes/cup.stl").unlink()
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda file: file.unlink(), id="missing"),
+        pytest.param(lambda file: file.write_bytes(b""), id="empty"),
+        pytest.param(
+            lambda file: file.write_bytes(file.read_bytes()[:-1] + b"?"), id="changed"
+        ),
+    ],
+)
+def test_interrupted_or_changed_folder_is_refused_and_kept(folder, wheel, damage):
+    damage(folder / "meshes/cup.stl")
     with pytest.raises(DemoError, match="empty folder"):
         fetch("myodm", folder, wheel=wheel)
     assert (folder / "clips/cup_lift.npz").is_file()

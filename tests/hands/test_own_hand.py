@@ -13,6 +13,7 @@ import flashdex.hands
 from flashdex.errors import RecipeError, UnknownHandError
 from flashdex.hands.spec import known_hands, load_hand
 from flashdex.recipe import compose, validate
+from flashdex.system.mjcf import ModelError
 
 
 @pytest.fixture
@@ -45,3 +46,13 @@ def test_without_its_folder_it_is_no_hand():
     recipe = dataclasses.replace(compose("quickstart"), hand="toyhand")
     with pytest.raises(RecipeError, match=r"'toyhand' is not a hand.*Known: xhand"):
         validate(recipe)
+
+
+def test_a_hand_that_reads_other_files_is_refused(toy_hand):
+    right = Path(flashdex.hands.__path__[-1]) / toy_hand / "right.xml"
+    text = right.read_text()
+    right.write_text(
+        text.replace("<worldbody", '<include file="/etc/passwd"/><worldbody')
+    )
+    with pytest.raises(ModelError, match=r"right\.xml: <include> is not allowed"):
+        load_hand(toy_hand)

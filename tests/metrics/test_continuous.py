@@ -13,6 +13,8 @@ from flashdex.metrics.continuous import (
     lift_ratio,
     mppe,
     object_path_length,
+    off_by,
+    path_ratio,
     sample_vertices,
     smoothness,
 )
@@ -86,3 +88,46 @@ def test_path_length_lift_and_smoothness():
     assert lift_ratio(arc, arc * 0.19) is None
     velocity = torch.arange(10.0)[:, None] * 0.02
     assert smoothness(velocity, fps=50) == pytest.approx(1.0, rel=1e-5)
+
+
+def rise(height, *, steps=31, path=0.0):
+    """A track that rises, and swings sideways over ``path`` metres."""
+    track = torch.zeros(steps, 3, dtype=torch.float64)
+    track[:, 2] = torch.linspace(0, height, steps)
+    track[:, 0] = torch.linspace(0, path, steps)
+    return track
+
+
+@pytest.mark.parametrize(
+    ("ratio", "off"),
+    [(1.0, 0.0), (1.25, 0.25), (0.8, 0.25), (0.0, 999.0), (-3.0, 999.0), (None, 0.0)],
+)
+def test_a_ratio_is_as_far_off_above_as_below(ratio, off):
+    assert off_by(ratio) == pytest.approx(off)
+
+
+@pytest.mark.parametrize("steps", [31, 61, 1001])
+def test_path_ratio_is_that_of_lengths_whatever_the_rate(steps):
+    found = path_ratio(rise(0.05, steps=steps), rise(0.1, steps=steps))
+    assert found == pytest.approx(0.5, abs=0.01)
+
+
+def test_noise_at_rest_is_no_path():
+    noise = 0.001 * torch.randn(600, 3, generator=torch.Generator().manual_seed(0))
+    # frame by frame it walks more than a metre
+    assert object_path_length(noise) > 1.0
+    assert path_ratio(torch.zeros(600, 3), noise) is None
+    moved = torch.zeros(600, 3)
+    moved[300:, 0] = torch.linspace(0, 0.3, 300)
+    assert path_ratio(moved, moved + noise) == pytest.approx(1, abs=0.1)
+
+
+def test_a_reference_that_hardly_moves_asks_for_no_path():
+    assert path_ratio(rise(1.0), rise(0.01)) is None
+
+
+def test_there_and_back_is_a_path_and_no_lift():
+    there = rise(0.1, steps=31)
+    track = torch.cat([there, there.flip(0)])
+    assert path_ratio(track, there) == pytest.approx(2.0, abs=0.1)
+    assert lift_ratio(track, there.repeat_interleave(2, 0)) == pytest.approx(1.0)

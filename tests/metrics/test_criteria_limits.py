@@ -1,12 +1,18 @@
 """Every limit at, below and above: signals are given, so that numbers are exact."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from flashdex.errors import UnknownNameError
-from flashdex.metrics.criteria import resolve_criterion, score
+from flashdex.metrics.criteria import (
+    moves_too_little,
+    resolve_criterion,
+    score,
+    worst_movement,
+)
 from flashdex.metrics.errors import TrackingErrors
 
 T, GRACE = 47, 15
@@ -57,6 +63,8 @@ CASES = [
     ("sr_mt_x0.5", "joint", 0.04, True),
     ("sr_mt_x2", "fingertip", 0.12, True),
     ("sr_mt_x2", "joint", 0.16, True),
+    ("sr_mt_obj_moved", "object_pos", 0.03, True),
+    ("sr_mt_obj_moved", "object_rot", 30 * DEG, True),
     ("sr_loose", "object_pos", 0.10, True),
     ("sr_loose", "object_rot", 30 * DEG, True),
     ("sr_mt_obj_frame", "object_pos", 0.03, True),
@@ -131,3 +139,27 @@ def test_names_resolve_and_unknown_names_are_explained():
     assert resolve_criterion("sr_mt_obj_left") == "sr_mt_obj_left"
     with pytest.raises(UnknownNameError, match="Did you mean 'sr_mt_obj'"):
         resolve_criterion("sr_mt_objj")
+
+
+@pytest.mark.parametrize(
+    ("rise", "state"),
+    [
+        *((1.0, "passed"), (0.81, "passed"), (0.79, "failed"), (1.24, "passed")),
+        *((1.26, "failed"), (0.0, "failed"), (-1.0, "failed")),
+    ],
+)
+def test_an_object_has_to_rise_as_its_reference_does(rise, state):
+    """Reference: 7 cm in the last third; standing still keeps a mean of 3 cm."""
+    given = signals()
+    ref = torch.zeros(T, 2, 3, dtype=torch.float64)
+    ref[-T // 3 :, :, 2] = torch.linspace(0, 0.07, T // 3 + 1)[:, None]
+    offset = torch.zeros_like(ref)
+    offset[:, 1] = ref[:, 1] * (rise - 1)
+    moved = replace(given, ref_object_pos=ref, object_pos_offset=offset)
+    found = score(moved, grace=GRACE)
+    assert found["sr_mt_obj"].state == ("failed" if rise < 0 else "passed")
+    assert found["sr_mt_obj_moved"].state == state
+    assert found["sr_mt_obj_moved_left"].is_passed
+    ratio = worst_movement(moved)["lift"]
+    assert ratio == pytest.approx(max(rise, 0.0))
+    assert moves_too_little(worst_movement(moved)) == (rise < 0.8)

@@ -1,5 +1,6 @@
 """Jobs: what is done is not done again, and one bad recording costs only itself."""
 
+import json
 import os
 import signal
 from dataclasses import replace
@@ -269,3 +270,65 @@ def test_objects_without_a_slot_are_chosen_by_touch_and_told():
     assert aligned.object_names[-1] == "box"
     codes = [f.code for f in check_left_out(aligned)]
     assert codes == ["W_OBJECTS"]
+
+
+def change_entries(file, change):
+    """Change what a file of the cache says of its motions."""
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    entries = json.loads(str(arrays["entries"]))
+    change(entries)
+    arrays["entries"] = np.array(json.dumps(entries))
+    np.savez_compressed(file, **arrays)
+
+
+HARM = {
+    "pickle": lambda f: np.savez(f, entries=np.array([print], dtype=object)),
+    "torn": lambda f: f.write_bytes(f.read_bytes()[:-100]),
+    "bomb": lambda f: np.savez_compressed(f, entries=np.zeros(1 << 24)),
+    "no_entries": lambda f: np.savez(f, other=np.zeros(3)),
+    "numbers": lambda f: np.savez(f, entries=np.zeros(3)),
+    "deep": lambda f: np.savez(f, entries=np.array("[" * 10**5)),
+    "other_list": lambda f: change_entries(f, lambda e: e.append(1)),
+    "no_row": lambda f: change_entries(f, lambda e: e[0].pop("row")),
+    "record_of_another_kind": lambda f: change_entries(
+        f, lambda e: e[0].update(record={"objects": [], "evil": 1})
+    ),
+    "object_elsewhere": lambda f: change_entries(
+        f, lambda e: e[0].update(record={"objects": [["a", "../../evil"]]})
+    ),
+    "row_of_another_kind": lambda f: change_entries(f, lambda e: e[0].update(row=[])),
+}
+
+
+@pytest.mark.parametrize("harm", HARM.values(), ids=HARM)
+def test_harmful_cache_file_is_made_again(settings, recording, harm):
+    first = run_job(Job(recording, settings))
+    harm(first.file)
+    again = run_job(Job(recording, settings))
+    assert again.rows == first.rows
+    assert run_job(Job(replace(recording, read=never), settings)).rows == first.rows
+
+
+def test_link_planted_in_the_cache_is_replaced_not_followed(
+    settings, recording, tmp_path
+):
+    file = run_job(Job(recording, settings)).file
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    file.unlink()
+    file.symlink_to(mine)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    temporary.symlink_to(mine)
+    run_job(Job(recording, settings))
+    assert mine.read_text() == "mine"
+    assert file.is_file()
+    assert not file.is_symlink()
+
+
+def test_pipe_planted_in_the_cache_is_not_waited_for(settings, recording):
+    first = run_job(Job(recording, settings))
+    first.file.unlink()
+    os.mkfifo(first.file)
+    assert run_job(Job(recording, settings)).rows == first.rows
+    assert first.file.is_file()

@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -207,10 +208,63 @@ def test_signs_and_norms(demo):
     assert codes(found) == [("E_ROT", "warn"), ("I_SIGN", "info")]
     assert "norm off by 0.05 in 1 frames, first in frame 12" in found[0].text
     assert found[1].text == "2 quaternion flips undone"
-    demo.objects[1].pose[12, 3:] = 0.0
+    demo.objects[1].pose[12, 3:] *= 2
     pieces, found = repair(demo)
     assert pieces == []
     assert codes(found) == [("E_ROT", "reject")]
+
+
+MARKS = [0.0, -1.0, 999.0, np.nan]
+
+
+@pytest.mark.parametrize("mark", MARKS)
+@pytest.mark.parametrize("palm", ["marked", "identity", "none"])
+def test_marks_of_untracked_hands_are_gaps(demo, mark, palm):
+    whole = copy.deepcopy(demo)
+    points = demo.keypoints["right"].copy()
+    points[30:33] = mark
+    palms = demo.palm["right"].copy()
+    palms[30:33] = mark if palm == "marked" else [0, 0, 0, 1, 0, 0, 0]
+    given = {} if palm == "none" else {"right": palms}
+    made = replace(demo, keypoints={"right": points}, palm=given)
+    assert np.isnan(made.keypoints["right"][30:33]).all()
+    (out,), found = repair(made)
+    assert codes(found) == [("E_NAN", "info")]
+    assert "3 frames interpolated, first frame 30" in found[0].text
+    same = replace(whole, keypoints={"right": whole.keypoints["right"]})
+    np.testing.assert_allclose(
+        out.keypoints["right"], same.keypoints["right"], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("mark", MARKS)
+def test_marks_of_untracked_objects_are_gaps(demo, mark):
+    pose = demo.objects[1].pose.copy()
+    pose[30:33] = mark
+    body = DemoObject("spare", demo.objects[1].mesh, pose)
+    (out,), found = repair(replace(demo, objects=[demo.objects[0], body]))
+    assert codes(found) == [("E_NAN", "info")]
+    np.testing.assert_allclose(out.objects[1].pose, demo.objects[1].pose, atol=1e-4)
+
+
+@pytest.mark.parametrize("mark", MARKS)
+def test_hand_of_marks_only_is_left_out(demo, mark):
+    left = np.full((90, 21, 3), mark)
+    (out,), _ = repair(replace(demo, keypoints=demo.keypoints | {"left": left}))
+    assert list(out.keypoints) == ["right"]
+
+
+def test_zero_quaternion_is_a_gap(demo):
+    demo.objects[1].pose[12, 3:] = 0.0
+    _, found = repair(demo)
+    assert codes(found) == [("E_NAN", "info")]
+
+
+def test_points_that_are_missing_alone_are_named(demo):
+    demo.keypoints["right"][15:65, 20] = np.nan
+    pieces, found = repair(demo)
+    assert pieces == []
+    assert "right hand: keypoint 20 (pinky tip) missing in 50 frames" in found[0].text
 
 
 def test_flickering_hand_is_missing(demo):

@@ -48,6 +48,13 @@ def grid_points(asset):
     return nodes + asset.sdf_origin
 
 
+def change(file, **values):
+    """Write a file of the cache anew, sound but with other values."""
+    with np.load(file) as stored:
+        arrays = dict(stored) | values
+    np.savez_compressed(file, **arrays)
+
+
 def box_distance(points, centre, half):
     over = np.abs(points - centre) - half
     outside = np.linalg.norm(over.clip(0), axis=-1)
@@ -253,8 +260,22 @@ def test_settings_and_shape_change_the_key(box, cache):
         lambda file: file.write_bytes(bytes(reversed(file.read_bytes()))),
         lambda file: np.savez(file, points=np.zeros(3)),
         lambda file: np.savez(file, points=np.array([{}], dtype=object)),
+        lambda file: change(file, mass=np.array(np.nan)),
+        lambda file: change(file, mass=np.array(-0.1)),
+        lambda file: change(file, mass=np.array("heavy")),
+        lambda file: change(file, com=np.float32([1.0, 0, 0])),
+        lambda file: change(file, inertia=-np.eye(3, dtype="f4")),
+        lambda file: change(file, inertia=np.diag(np.float32([1, 1, 9]))),
+        lambda file: change(file, sdf=np.full((24, 24, 24), np.nan, "f4")),
+        lambda file: change(file, part_vertices=np.full((8, 3), np.inf, "f4")),
+        lambda file: change(file, part_sizes=np.zeros((), int)),
+        lambda file: change(file, points=np.zeros((9000, 9000))),
     ],
-    ids=["empty", "text", "cut", "reversed", "fields", "pickle"],
+    ids=[
+        *("empty", "text", "cut", "reversed", "fields", "pickle"),
+        *("mass_nan", "mass_negative", "mass_text", "com_outside", "inertia_negative"),
+        *("inertia_of_no_body", "sdf_nan", "part_infinite", "sizes_shape", "bomb"),
+    ],
 )
 def test_damaged_cache_file_is_computed_again(tmp_path, caplog, damage):
     mesh = trimesh.creation.box(extents=(0.05, 0.05, 0.05))

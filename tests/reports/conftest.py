@@ -82,6 +82,10 @@ def run_dir(empty_run, rollout, certificate):
         "rollout": "rollouts/push.npz",
         "certified": True,
         "verdict": "robust",
+        "lift_ratio": None,
+        "path_ratio": 0.98,
+        "hands": ["left"],
+        "frame": 36,
     }
     dropped = [("object_dropped", "right")]
     lines = [
@@ -93,6 +97,7 @@ def run_dir(empty_run, rollout, certificate):
         converted,
         attempt("turn", 14_000, errors={"object_pos": 0.0412, "object_rot": 0.2}),
     ]
+    lines[-1]["wall_s"] = 90.0
     for line in lines:
         if line["motion"] == "turn":
             line["why"] = [{"cause": "object_pos", "hand": "left"}]
@@ -113,8 +118,8 @@ def run_dir(empty_run, rollout, certificate):
     ]
     write_lines(run / "metrics.jsonl", metrics)
     scored = {
-        "passed": ["sr_mt_obj"],
-        "state": "passed",
+        "passed": [],
+        "state": "failed",
         "errors": {"object_pos": 0.0071, "object_rot": math.radians(4)},
     }
     failed = {

@@ -2,8 +2,8 @@
 
 import base64
 import csv
+import dataclasses
 import io
-import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mutations import KINDS
 from PIL import Image
-from tensordict import TensorDict
+from synthetic import write_library
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
@@ -29,7 +30,7 @@ from flashdex.reports.library.report import summary_lines, write_library_report
 from flashdex.reports.render.films import NO_GRAPHICS, find_backend
 from flashdex.reports.render.stills import contact_of, draw_thumbnails, still_frames
 
-EVIL = '</td><script>alert("x")</script><img src=x onerror=alert(1)> & co'
+EVIL = '"><script>alert("x")<img src=x onerror=alert(1)> & co'
 EVIL_REASON = "E_DEMO: <b onclick='x'>a/b.npz</b>: \x1b[2J no key"
 VOID = {"meta", "img", "input", "wbr"}
 SPIKE = 0.123  # m, one frame of tip error
@@ -62,14 +63,37 @@ def plain(library, tmp_path):
     return MotionLibrary.load(path)
 
 
+def measure(record):
+    """Tip errors of 4 mm with one spike, 2 mm deep, right fingers close at frame 6."""
+    total = len(record.frames["joint_pos"])
+    error = np.full((total, 2, 5), 0.004)
+    contact = np.zeros((total, 2, 5), dtype=bool)
+    if record.name == "right_box":
+        error[10, 1, 2] = SPIKE
+        contact[6:, 1, :] = True
+    else:
+        contact[:, 1, :] = True
+    depth = np.full(total, 0.002)
+    record.quality = {"tip_error": error, "penetration": depth, "contact": contact}
+
+
+def rename(record):
+    record.name, record.info = EVIL, {"licence": "CC <0>"}
+
+
+@pytest.fixture(scope="module")
+def measured(hands, tmp_path_factory):
+    changes = {"right_box": [measure], "left_ball": [measure, rename]}
+    changes["both"] = [measure]
+    path = tmp_path_factory.mktemp("measured") / "mine"
+    return write_library(path, hands, changes=changes, manifest={"source": "made"})
+
+
 @pytest.fixture
-def mine(plain):
+def mine(measured, tmp_path):
     """Three motions, one flagged and of a hostile name, and three rejected."""
-    path = plain.path
-    manifest = json.loads((path / "manifest.json").read_text())
-    manifest["motions"][1] |= {"name": EVIL, "licence": "CC <0>"}
-    manifest["source"] = "made"
-    (path / "manifest.json").write_text(json.dumps(manifest))
+    path = tmp_path / "mine"
+    shutil.copytree(measured.path, path)
     rows = [
         good("right_box"),
         recording(EVIL, "rejected", EVIL_REASON),
@@ -80,14 +104,6 @@ def mine(plain):
     ]
     rows[2]["tip_error_p95_mm"] = 48.0
     write_rows(path, rows)
-    total = len(plain.frames)
-    error = torch.full((total, 2, 5), 0.004)
-    error[10, 1, 2] = SPIKE
-    contact = torch.zeros(total, 2, 5, dtype=torch.bool)
-    contact[6:, 1, :] = True
-    depth = torch.full((total,), 0.002)
-    quality = {"tip_error": error, "penetration": depth, "contact": contact}
-    TensorDict(quality, [total]).memmap(str(path / "quality"))
     return MotionLibrary.load(path)
 
 
@@ -361,17 +377,19 @@ def test_two_thousand_recordings_are_a_light_page(mine):
     assert len(text) < 2e6
 
 
-def test_names_that_are_no_text_are_written_all_the_same(mine):
-    manifest = json.loads((mine.path / "manifest.json").read_text())
-    manifest["motions"][0]["name"] = "half \ud800 pair"
-    (mine.path / "manifest.json").write_text(json.dumps(manifest))
-    _, page = write(MotionLibrary.load(mine.path))
-    assert "half ? pair" in {row["motion"] for row in records(page)}
-
-
 def test_a_report_that_is_no_table_is_refused(mine):
     cell = "x" * (csv.field_size_limit() + 1)
     (mine.path / "report.csv").write_text(f"motion,status\n{cell},kept\n")
+    with pytest.raises(LibraryError, match=r"report\.csv: not a readable table"):
+        write_library_report(mine, thumbnails=False)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "folder", "fifo"])
+def test_a_report_that_is_no_file_of_the_library_is_not_shown(
+    mine, tmp_path, monkeypatch, kind
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    KINDS[kind](mine.path / "report.csv", np.random.default_rng(0))
     with pytest.raises(LibraryError, match=r"report\.csv: not a readable table"):
         write_library_report(mine, thumbnails=False)
 
@@ -420,10 +438,16 @@ def test_pictures_show_objects_and_hands(mine, backend):
             assert (grey & (red < 140)).sum() > 300  # the hand
 
 
-def test_a_motion_that_cannot_be_drawn_does_not_spoil_the_others(mine, backend):
-    file = mine.path / mine.manifest["objects"][0]["visual"]
-    file.write_text("nothing")
-    drawn, fault = draw_thumbnails(mine, [0, 1])
+def test_a_motion_that_cannot_be_drawn_does_not_spoil_the_others(
+    hands, tmp_path, backend
+):
+    def flatten(record):  # a surface that MuJoCo takes for no mesh
+        shape = {"visual_vertices": np.zeros((4, 3), np.float32)}
+        shape["visual_faces"] = np.array([[0, 1, 2]], np.int32)
+        record.objects = [dataclasses.replace(record.objects[0], sha256="f", **shape)]
+
+    library = write_library(tmp_path / "a", hands, changes={"right_box": [flatten]})
+    drawn, fault = draw_thumbnails(library, [0, 1])
     assert list(drawn) == [1]
     assert fault.startswith("no pictures of 1 of 2 motions: right_box: ")
 

@@ -10,6 +10,7 @@ import yaml
 
 from flashdex.errors import RunError
 from flashdex.reports.run.report import write_report
+from flashdex.reports.run.terminal import run_table
 
 VOID = {"meta", "img"}
 
@@ -35,7 +36,7 @@ def test_headline_and_header(run_dir):
         "converted": "1/5",  # five motions by the rate, three of them tried
         "certified": "1/1",
         "robust": "1/1",
-        "trivial": "1/1",
+        "and trivial": "0",
         "attempts": "7",
     }
     facts = header(text)
@@ -50,15 +51,37 @@ def test_headline_and_header(run_dir):
     assert "2 more motions were not attempted yet" in text
 
 
+TRIVIAL = {
+    "a baseline passes": {"trivial": ["kinematic_playback"]},
+    "the object hardly moves": {"trivial": ["moves_too_little"]},
+}
+
+
+@pytest.mark.parametrize("kind", TRIVIAL)
+def test_trivial_conversions_are_counted_apart_everywhere(run_dir, kind, table_rows):
+    path = run_dir / "conversions.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [x | TRIVIAL[kind] if x["converted"] else x for x in lines]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    page = read_report(run_dir)
+    found = headline(page)
+    assert (found["converted"], found["and trivial"]) == ("0/5", "1")
+    assert found["certified"] == found["robust"] == "0/0"
+    assert table_rows(page)[0]["motion"] == "push trivial"
+    said = run_table(run_dir)
+    assert "0 of 5 converted by sr_mt_obj, 0 certified (0 robust), and 1 triv" in said
+
+
 def test_row_of_a_conversion(run_dir, certificate, table_rows):
     row = table_rows(read_report(run_dir))[0]
-    assert row["motion"] == "push trivial"
+    assert row["motion"] == "push"
     assert row["hands"] == "left"
     assert row["attempts"] == "2"
     assert row["env steps"] == "12,345"
     assert row["minutes"] == "1.5"
     assert row["object mm (≤\u00a030)"] == "5.0"
     assert row["object deg (≤\u00a030)"] == "2.0"
+    assert (row["lift ratio"], row["path ratio"]) == ("\u2013", "0.98")
     assert row["certificate"] == certificate.verdict == "robust"
     share = certificate.perturbed["pass_fraction"]["sr_mt_obj"]
     assert row["robust share"] == f"{share:.0%}"
@@ -66,7 +89,7 @@ def test_row_of_a_conversion(run_dir, certificate, table_rows):
     assert row["penetration mm"] == f"{depth:.1f}"
     assert row["force N"] == f"{certificate.safety['force_peak']:.1f}"
     assert row["do nothing, mm / deg"] == "63 / 11"
-    assert row["playback, mm / deg"] == "7 / 4 passes"
+    assert row["playback, mm / deg"] == "7 / 4"
     assert row["failures"] == "fingertip_off left 100%"
 
 

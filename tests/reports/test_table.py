@@ -21,7 +21,10 @@ def row_of(text, name):
 
 def test_facts_of_a_run(run_dir, certificate):
     text = run_table(run_dir)
-    assert "1/5 converted by sr_mt_obj, 1 certified (1 robust), 1 trivial, 7" in text
+    assert (
+        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust), and 0 trivial, 7"
+        in text
+    )
     assert "16,000 env steps in 2 min 24 s" in text
     row = row_of(text, "push")
     depth = certificate.safety["penetration_max_mm"]
@@ -33,6 +36,8 @@ def test_facts_of_a_run(run_dir, certificate):
         "min": "1.5",
         "mm": "5.0",
         "deg": "2.0",
+        "lift": "-",
+        "path": "0.98",
         "proof": "robust",
         "pert": f"{certificate.perturbed['pass_fraction']['sr_mt_obj']:.0%}",
         "pen": f"{depth:.1f}",
@@ -67,8 +72,9 @@ def test_runs_without_baselines_or_attempts(run_dir, empty_run):
 
 def test_evaluation():
     row = {"motion": "lift", "sr_mt_obj": "passed", "sr_spider_raw": "not_measured"}
-    row["errors"] = {"object_pos": 0.0123, "object_rot": 0.1}
-    other = {**row, "motion": "turn", "sr_mt_obj": "failed", "errors": {}}
+    row |= {"mope": 12.3, "more": 0.1, "lift_ratio": 0.5, "path_ratio": None}
+    nothing = dict.fromkeys(("mope", "more", "lift_ratio", "path_ratio"))
+    other = {**row, **nothing, "motion": "turn", "sr_mt_obj": "failed"}
     totals = {
         "env_steps": 1234,
         "mope": None,
@@ -83,9 +89,9 @@ def test_evaluation():
     lines = [
         line.split() for line in evaluation_table([row, other], totals).splitlines()
     ]
-    assert ["lift", "yes", "n.m.", "12.3", "5.7"] in lines
-    assert ["turn", "no", "n.m.", "-", "-"] in lines
-    assert ["all", "2", "1/2", "0/0"] in lines
+    assert ["lift", "yes", "n.m.", "12.3", "5.7", "0.50", "-"] in lines
+    assert ["turn", "no", "n.m.", "-", "-", "-", "-"] in lines
+    assert ["all", "2", "1/2", "0/0", "12.3", "5.7"] in lines
     text = evaluation_table([row, other], totals)
     assert "over all motions (2): 12.3 mm, 5.7 deg" in text
     assert "sr_spider_centred (0): - mm, - deg" in text
@@ -98,6 +104,8 @@ def test_scores_show_value_and_limit(rollout):
     assert "object 5.0/30 mm, object 0.0/30 deg" in lines["sr_mt_obj"]
     assert "hand_absent" in lines["sr_mt_obj_right"]
     assert "not measured" in lines["sr_mt_obj_right"]
+    assert "lift off by" in lines["sr_mt_obj_moved"]
+    assert not [name for name in lines if name.startswith("completed")]
 
 
 def test_columns_and_short_forms():

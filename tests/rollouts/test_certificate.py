@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flashdex.errors import RunError, UnknownNameError
+from flashdex.errors import FlashdexError, UnknownNameError
 from flashdex.metrics.criteria_table import criterion_names
 from flashdex.rollouts.certificate import certify
 from flashdex.rollouts.resimulation import Perturbation
@@ -181,12 +181,12 @@ def test_fingertips_without_sites_are_not_measured(build_rollout, scene_xml):
         ({"ctrl": np.zeros((90, 3))}, "ctrl has 3 columns, the model needs 1"),
         (
             {"model_xml": "<mujoco><x/></mujoco>", "model_sha256": ""},
-            "does not compile",
+            "<x> is not allowed",
         ),
     ],
 )
 def test_file_that_does_not_fit_its_model_is_refused(rollout, change, message):
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(FlashdexError, match=message):
         certify(replace(rollout, **change))
 
 
@@ -204,7 +204,8 @@ def test_unknown_criterion_is_refused(rollout):
 def test_certificate_is_a_json_file(rollout, tmp_path):
     path = certify(rollout, num_perturbations=1).save(tmp_path / "c" / "push.json")
     data = json.loads(path.read_text())
-    assert data["identity"]["schema"] == 1
+    assert data["identity"]["schema"] == 2
+    assert len(data["identity"]["rollout_sha256"]) == 64
     assert data["identity"]["certified_by"]["engine"] == "mujoco"
     assert len(data["model"]["compiled_sha256"]) == 64
     assert data["model"]["iterations"] >= 100

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 
 import numpy as np
 import pytest
+import tamper
 import torch
 
+from flashdex.errors import FlashdexError, RunError
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.ledger import CONVERSIONS, Ledger, read_lines
+from flashdex.rollouts.ledger import CONVERSIONS, UNMOVED, Ledger, rollout_name
 from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.verify import verify_run
+from flashdex.system.jsonl import append_line, read_lines, write_lines
 
 REQUIRED = {
     "motion": str,
@@ -164,7 +169,7 @@ def test_a_cut_off_last_line_costs_that_line_only(
 def test_a_broken_line_in_the_middle_is_an_error(tmp_path):
     path = tmp_path / "x.jsonl"
     path.write_text('{"a": 1}\n{"b":\n{"c": 2}\n')
-    with pytest.raises(ValueError, match="Expecting"):
+    with pytest.raises(RunError, match="line 2 is not JSON"):
         read_lines(path)
 
 
@@ -172,9 +177,8 @@ def test_lines_of_another_criterion_or_motion_do_not_count(tmp_path, library, pa
     record(open_ledger(tmp_path, library), passing, env_steps=10, wall_s=2.0)
     strict = open_ledger(tmp_path, library, criterion="sr_mt_obj_x0.5")
     assert strict.num_converted == 0
-    (tmp_path / CONVERSIONS).write_text(
-        (tmp_path / CONVERSIONS).read_text().replace("right_box", "left_out")
-    )
+    lines = read_lines(tmp_path / CONVERSIONS)
+    write_lines(tmp_path / CONVERSIONS, [x | {"motion": "left_out"} for x in lines])
     assert open_ledger(tmp_path, library).num_converted == 0
 
 
@@ -189,3 +193,190 @@ def test_a_later_pass_may_prove_what_the_first_could_not(tmp_path, library, pass
     assert [bool(x.get("rollout")) for x in lines] == [True, True]
     assert first["env_steps"] == 10
     assert ledger.metrics(1.0)["convert/robust"] == 0
+
+
+def test_what_is_trivial_is_counted_apart(tmp_path, library, passing):
+    ledger = open_ledger(tmp_path, library, trivial={"right_box": ["do_nothing"]})
+    record(ledger, passing, env_steps=10, wall_s=2.0)
+    assert (ledger.num_converted, ledger.num_trivial, ledger.num_passed) == (0, 1, 1)
+    assert ledger.note == "0 of 3 converted, and 1 trivial"
+    found = ledger.metrics(1.0)
+    assert next(iter(found)) == "convert/nontrivial"
+    assert (found["convert/nontrivial"], found["convert/trivial"]) == (0, 1)
+    assert found["convert/cumulative"] == 1
+
+
+def test_an_object_that_hardly_moves_is_trivial_until_it_moves(
+    tmp_path, library, passing
+):
+    still = copy.deepcopy(passing)
+    still.object_pos[:] = still.object_pos[:1]
+    ledger = open_ledger(tmp_path, library)
+    assert record(ledger, still, env_steps=10, wall_s=2.0)
+    line = read_lines(tmp_path / CONVERSIONS)[-1]
+    assert line["trivial"] == [UNMOVED]
+    assert (line["lift_ratio"], line["path_ratio"]) == (0.0, 0.0)
+    assert ledger.note == "0 of 3 converted, and 1 trivial"
+    record(ledger, passing, env_steps=20, wall_s=3.0)
+    assert ledger.note == "1 of 3 converted, 0 certified"
+    assert ledger.conversions["right_box"]["env_steps"] == 20
+    # a later one that hardly moves takes nothing back, nor does a new session
+    record(ledger, still, env_steps=30, wall_s=4.0)
+    stored = Rollout.load(tmp_path / rollout_name("right_box"))
+    assert (stored.object_pos == passing.object_pos).all()
+    for again in (ledger, open_ledger(tmp_path, library)):
+        assert (again.num_converted, again.num_trivial) == (1, 0)
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "", "a\0b", "a\nb", "x" * 300, 7])
+def test_a_name_that_is_none_makes_no_file(tmp_path, name):
+    with pytest.raises(FlashdexError, match="no name of a motion"):
+        Ledger(tmp_path / "run", [name], criterion="sr_mt_obj", seed=0, engine="cpu")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["päck aus", "a b", "CON", "-x"])
+def test_any_name_has_files_of_plain_names(tmp_path, passing, name):
+    passing.motion = name
+    ledger = Ledger(
+        tmp_path, [name], criterion="sr_mt_obj", seed=0, engine="cpu", certify=False
+    )
+    line, _ = ledger.record(passing, wall_s=1.0)
+    assert line["rollout"] == rollout_name(name)
+    assert (tmp_path / line["rollout"]).is_file()
+    assert line["rollout"].isascii()
+    assert Rollout.load(tmp_path / line["rollout"]).motion == name
+
+
+LINKS = {
+    "ledger": CONVERSIONS,
+    "rollout": "rollouts/right_box.npz",
+    "folder": "rollouts",
+}
+
+
+@pytest.mark.parametrize("place", LINKS)
+def test_a_link_is_not_written_through(tmp_path, library, passing, place):
+    run, other = tmp_path / "run", tmp_path / "other"
+    (run / "rollouts").mkdir(parents=True)
+    if place == "folder":
+        (run / "rollouts").rmdir()
+        other.mkdir()
+    else:
+        other.write_bytes(b"precious")
+    (run / LINKS[place]).symlink_to(other)
+    with pytest.raises(RunError, match="is a link"):
+        record(open_ledger(run, library), passing, env_steps=1, wall_s=1.0)
+    assert list(other.iterdir()) == [] if other.is_dir() else True
+    assert other.is_dir() or other.read_bytes() == b"precious"
+
+
+@pytest.fixture
+def orphan(converted_run, tmp_path):
+    """A stored rollout whose line a crash has cost, and its ledger opened again."""
+    run = tmp_path / "run"
+    shutil.copytree(converted_run / "rollouts", run / "rollouts")
+
+    def reopen():
+        return Ledger(run, ["right_box"], criterion="sr_mt_obj", seed=0, engine="cpu")
+
+    return run, reopen
+
+
+def test_a_rollout_without_its_line_gets_one_and_holds(orphan, truth):
+    run, reopen = orphan
+    assert reopen().adopt(wall_s=9.0) == ["right_box"]
+    assert reopen().adopt(wall_s=9.0) == []
+    (line,) = read_lines(run / CONVERSIONS)
+    assert (line["wall_s"], line["verdict"]) == (9.0, "robust")
+    assert verify_run(run).holds
+
+
+DAMAGES = {
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),
+    "flipped": lambda path: path.write_bytes(
+        path.read_bytes()[:5000] + b"?" + path.read_bytes()[5001:]
+    ),
+    "something else": lambda path: path.write_text("hello"),
+    "of another motion": lambda path: tamper_with(path, motion="left_ball"),
+    "reference is the result": lambda path: tamper_with(
+        path, object_pos=tamper.load(path)["ref_object_pos"]
+    ),
+    "assisted": lambda path: tamper_with(
+        path, wrench=tamper.load(path)["wrench"] + 1.0
+    ),
+}
+
+
+def tamper_with(path, **changes):
+    data = tamper.load(path)
+    tamper.store(path, data | {k: np.asarray(v) for k, v in changes.items()})
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_a_damaged_rollout_is_told_and_not_adopted(orphan, caplog, kind):
+    run, reopen = orphan
+    path = run / "rollouts" / "right_box.npz"
+    DAMAGES[kind](path)
+    before = path.read_bytes()
+    assert reopen().adopt(wall_s=9.0) == []
+    assert "left as it is" in caplog.text
+    assert path.read_bytes() == before
+    assert read_lines(run / CONVERSIONS) == []
+
+
+def test_a_rollout_changed_after_its_line_is_not_adopted(orphan, caplog):
+    run, reopen = orphan
+    reopen().adopt(wall_s=9.0)
+    path = run / "rollouts" / "right_box.npz"
+    tamper_with(path, seed=5)
+    assert reopen().adopt(wall_s=10.0) == []
+    assert "changed after its line was written" in caplog.text
+
+
+FOREIGN = {
+    "NUL tail": (b"\0" * 50, True),
+    "cut off": (b'{"motion": "right', True),
+    "blank": (b"\n", False),
+    "garbage": (b"garbage\n", False),
+    "list": (b"[1]\n", False),
+    "latin-1": ('{"motion": "p\u00e4ck"}\n'.encode("latin-1"), False),
+    "BOM": (b"\xef\xbb\xbf{}\n", False),
+    "without its keys": (b'{"motion": "right_box"}\n', False),
+    "another kind": (
+        b'{"motion": 3, "converted": true, "criterion": "sr_mt_obj", "errors": {}, '
+        b'"env_steps": 1, "wall_s": 1.0}\n',
+        False,
+    ),
+    "deep": (b"[" * 100_000 + b"\n", False),
+}
+
+
+@pytest.mark.parametrize("sealed", [True, False], ids=["sealed", "older"])
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_foreign_line_is_refused_and_a_torn_one_removed(
+    tmp_path, library, passing, kind, sealed
+):
+    tail, is_torn = FOREIGN[kind]
+    record(open_ledger(tmp_path, library), passing, env_steps=10, wall_s=2.0)
+    path = tmp_path / CONVERSIONS
+    lines = read_lines(path)
+    if not sealed:
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    path.write_bytes(path.read_bytes() + tail)
+    if is_torn:
+        assert open_ledger(tmp_path, library).num_passed == 1
+        assert read_lines(path) == lines
+    else:
+        with pytest.raises(RunError, match="line 2"):
+            open_ledger(tmp_path, library)
+
+
+def test_a_line_that_names_another_file_is_not_followed(tmp_path, library, passing):
+    record(open_ledger(tmp_path, library), passing, env_steps=10, wall_s=2.0)
+    (line,) = read_lines(tmp_path / CONVERSIONS)
+    evil = line | {"rollout": "../../evil.npz", "env_steps": 20}
+    append_line(tmp_path / CONVERSIONS, evil)
+    found = verify_run(tmp_path)
+    assert any("not the rollout of its motion" in str(f) for f in found.findings)

@@ -7,7 +7,15 @@ import sys
 import pytest
 
 from flashdex.errors import RunError
-from flashdex.system.files import open_atomic, run_lock, waiting_lock, write_atomic
+from flashdex.system.files import (
+    open_atomic,
+    own_file,
+    own_files,
+    own_folder,
+    run_lock,
+    waiting_lock,
+    write_atomic,
+)
 
 HOLD = """
 import sys, time
@@ -97,3 +105,59 @@ def test_a_folder_that_cannot_be_made_is_worked_in_without_a_lock(tmp_path):
     (tmp_path / "file").write_text("")
     with waiting_lock(tmp_path / "file" / "asset"):
         pass
+
+
+def test_own_files_lie_below_their_folder(tmp_path):
+    root = tmp_path / "run"
+    (root / "deep" / "er").mkdir(parents=True)
+    for name in ("a", "deep/b", "deep/er/c"):
+        (root / name).write_text(name)
+        assert own_file(root, name).read_text() == name
+    assert own_file(root, "new", "file") == root / "new" / "file"
+    assert [p.name for p in own_files(root, "deep", "b*")] == ["b"]
+    (tmp_path / "moved").symlink_to(root)  # the user's own choice
+    assert own_file(tmp_path / "moved", "deep", "b").read_text() == "deep/b"
+
+
+ELSEWHERE = ["../b", "deep/../../b", "/etc/passwd", "", ".", "a\0b", "x" * 300, "a/b"]
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_a_path_that_leaves_the_folder_is_refused(tmp_path, name):
+    root = tmp_path / "run"
+    (root / "deep").mkdir(parents=True)
+    (root / "a").write_text("a file, no folder")
+    (tmp_path / "b").write_text("elsewhere")
+    with pytest.raises(RunError, match="run"):
+        own_file(root, name)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "folder link", "pipe", "folder"])
+def test_only_regular_files_are_ones_own(tmp_path, kind):
+    root, other = tmp_path / "run", tmp_path / "other"
+    root.mkdir()
+    other.mkdir()
+    (other / "b").write_text("keep")
+    names = {"folder link": "sub/b"}
+    if kind == "pipe":
+        os.mkfifo(root / "b")
+    elif kind == "folder":
+        (root / "b").mkdir()
+    elif kind == "folder link":
+        (root / "sub").symlink_to(other)
+        with pytest.raises(RunError, match="a link, not a folder of its own"):
+            own_folder(root, "sub")
+    else:
+        (root / "b").symlink_to(other / ("b" if kind == "link" else "nothing"))
+    with pytest.raises(RunError, match="of its own"):
+        own_file(root, names.get(kind, "b"))
+    assert own_folder(root, "new").is_dir()
+
+
+def test_a_link_under_the_name_of_a_temporary_file_is_not_followed(tmp_path):
+    (tmp_path / "other").write_text("keep")
+    (tmp_path / f".a.{os.getpid()}.tmp").symlink_to(tmp_path / "other")
+    write_atomic(tmp_path / "a", "new")
+    assert (tmp_path / "other").read_text() == "keep"
+    assert (tmp_path / "a").read_text() == "new"
+    assert not (tmp_path / "a").is_symlink()

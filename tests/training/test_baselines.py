@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import os
+
+import numpy as np
+import pytest
+import torch
+from synthetic import write_library
 
 from flashdex.cli.main import main
-from flashdex.training.baselines import Baselines, format_baselines
+from flashdex.envs.scene.scene import build_scenes
+from flashdex.training import baselines, build
+from flashdex.training.baselines import (
+    Baselines,
+    format_baselines,
+    score_baselines,
+)
+from flashdex.training.evaluator import roll_all
 
 
 def test_table_counts_motions_by_criterion():
@@ -41,3 +55,132 @@ def test_command_scores_a_library(library, tmp_path, capsys):
 def test_gym_recipe_has_no_baselines(capsys):
     assert main(["baselines", "gym_halfcheetah"]) == 2
     assert "gym" in capsys.readouterr().err
+
+
+@pytest.fixture
+def rolled(monkeypatch):
+    """Rows that each call rolls, of the two baselines that are simulated.
+
+    What is simulated is the same in all tests, and done once.
+    """
+    seen = []
+
+    def roll(builder, controller, *, rows, target):
+        names = [builder.bank.names[row] for row in rows]
+        seen.append(names)
+        for row, name in zip(rows, names, strict=True):
+            if (target, name) not in ROLLED:
+                whole = roll_all(builder, controller, rows=[row], target=target)
+                ROLLED[target, name] = next(whole)
+            yield ROLLED[target, name]
+
+    monkeypatch.setattr(baselines, "roll_all", roll)
+    return seen
+
+
+ROLLED = {}
+
+
+def test_a_session_pays_for_what_changed_only(make_bench, hands, tmp_path, rolled):
+    bench, file = make_bench(), tmp_path / "baselines.json"
+    rows = score_baselines(bench, file).rows
+    names = bench.library.names
+    assert rolled == [names] * 2
+    assert score_baselines(make_bench(), file).rows == rows
+    assert rolled[2:] == [[]] * 2
+
+    def heavier(record):  # the same name, another object
+        mass = 1.5 * record.objects[0].mass
+        box = dataclasses.replace(record.objects[0], mass=mass, sha256="heavy")
+        record.objects = [box, *record.objects[1:]]
+
+    changes = {"right_box": [heavier]}
+    other = write_library(tmp_path / "other", hands, changes=changes)
+    builder = dataclasses.replace(make_bench(), library=other)
+    score_baselines(builder, file)
+    assert rolled[4:] == [["right_box"]] * 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "is_paid"),
+    [
+        ({"algo": {"actor_width": 32}}, False),
+        ({"num_envs": 3}, False),
+        ({"rewards": {}}, False),
+        ({"train": {"criterion": "sr_mt"}}, True),
+        ({"wrist_lead": True}, True),
+        ({"max_seconds": 0.3}, True),
+    ],
+    ids=["network", "worlds", "rewards", "criterion", "lead", "length"],
+)
+def test_an_override_pays_for_baselines_that_it_changes(
+    make_bench, tmp_path, rolled, fields, is_paid
+):
+    file = tmp_path / "baselines.json"
+    score_baselines(make_bench(), file)
+    score_baselines(make_bench(**fields), file)
+    assert [bool(rows) for rows in rolled[2:]] == [is_paid] * 2
+
+
+def edited(rows):
+    rows["do_nothing"]["both"]["passed"] = ["sr_mt_obj"]
+    return json.dumps(rows)
+
+
+def exchanged(rows):
+    table = rows["do_nothing"]
+    table["both"], table["left_ball"] = table["left_ball"], table["both"]
+    return json.dumps(rows)
+
+
+SPOILT = {
+    "edited": edited,
+    "exchanged": exchanged,
+    "cut": lambda rows: json.dumps(rows)[:-40],
+    "list": lambda rows: "[]",
+    "rows-list": lambda rows: json.dumps({key: [1] for key in rows}),
+    "row-text": lambda rows: json.dumps(
+        {k: dict.fromkeys(v, "a") for k, v in rows.items()}
+    ),
+    "empty": lambda rows: "",
+    "deep": lambda rows: "[" * 100_000,
+    "zeros": lambda rows: "\0" * 100,
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_spoilt_file_is_scored_again(make_bench, tmp_path, rolled, case):
+    file = tmp_path / "baselines.json"
+    rows = score_baselines(make_bench(), file).rows
+    file.write_text(SPOILT[case](json.loads(file.read_text())))
+    assert score_baselines(make_bench(), file).rows == rows
+    assert json.loads(file.read_text()) == rows
+
+
+def test_a_pipe_in_its_place_is_not_waited_for(make_bench, tmp_path, rolled):
+    os.mkfifo(tmp_path / "baselines.json")
+    assert score_baselines(make_bench(), tmp_path / "baselines.json").rows
+
+
+def test_scenes_are_built_once_for_all_chunks(make_bench, monkeypatch):
+    built = []
+
+    def count(*words):
+        built.append(1)
+        return build_scenes(*words)
+
+    monkeypatch.setattr(build, "build_scenes", count)
+    monkeypatch.setattr("flashdex.envs.physics.base.build_scenes", count)
+    bench = make_bench()
+
+    def idle(td, env):
+        return torch.zeros(env.num_envs, 2, env.bank.num_joints)
+
+    one = list(roll_all(bench, idle, worlds=32))
+    # chunks of two and one, the spare world of the last one rolls along
+    two = list(roll_all(bench, idle, worlds=2))
+    bench.make_env()
+    assert len(built) == 1
+    for a, b in zip(one, two, strict=True):
+        assert a.motion == b.motion
+        assert np.array_equal(a.qpos, b.qpos)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from flashdex.datasets.fields import same_length
 from flashdex.datasets.files import load_npz, load_pickle
+from flashdex.datasets.roots import on_disk
 from flashdex.datasets.tracks import missing_frames, rotation
 from flashdex.errors import DemoError
 from flashdex.keys import Side
@@ -75,8 +76,8 @@ def mano_file(folder: Path, side: Side) -> Path:
     names = [f"MANO_{side.upper()}{ending}" for ending in (".pkl", ".npz")]
     for place in PLACES:
         for name in names:
-            if (folder / place / name).is_file():
-                return folder / place / name
+            if (file := on_disk(folder / place / name)).is_file():
+                return file
     places = ", ".join(str(folder / place) for place in PLACES)
     raise DemoError(
         f"no {names[0]} (or .npz) in {places}. Register at mano.is.tue.mpg.de, "
@@ -87,7 +88,7 @@ def mano_file(folder: Path, side: Side) -> Path:
 
 def read_mano(file: Path, side: Side) -> ManoArrays:
     """The checked content of a model file."""
-    data = load_npz(file) if file.suffix == ".npz" else load_pickle(file)
+    data = load_npz(file) if file.suffix.lower() == ".npz" else load_pickle(file)
     if not isinstance(data, dict):
         raise _wrong(file, f"it holds a {type(data).__name__}, not a model.")
     missing = sorted({KINTREE, *(key for key, _ in PARTS.values())} - set(data))

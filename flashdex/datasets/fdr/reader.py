@@ -19,7 +19,7 @@ from flashdex.datasets.fdr.pack import NAME as PACK_NAME
 from flashdex.datasets.fdr.pack import pack_names, pack_objects, unpack
 from flashdex.datasets.fields import require, words
 from flashdex.datasets.files import load_npz, refuse_clone
-from flashdex.datasets.roots import seek_mesh, shown
+from flashdex.datasets.roots import listed, seek_mesh, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 from flashdex.keys import SIDES
@@ -80,12 +80,12 @@ def read_packed(file: Path, row: int, folders: tuple[Path, ...]) -> list[HumanDe
 
 def _find(path: Path) -> tuple[list[Path], Path | None]:
     if path.is_file():
-        return ([path], None) if path.suffix == ".npz" else ([], path)
+        return ([path], None) if path.suffix.lower() == ".npz" else ([], path)
     for folder in (path / CLIP_FOLDERS[0], path, path / CLIP_FOLDERS[1]):
         # ``.tmp.npz``: FDR was stopped while it wrote a clip
-        clips = [c for c in folder.glob("*.npz") if not c.name.endswith(".tmp.npz")]
+        clips = [c for c in listed(folder, "*.npz") if not c.match("*.tmp.npz")]
         if clips:
-            return sorted(clips), None
+            return clips, None
     if (path / PACK_NAME).is_file():
         return [], path / PACK_NAME
     raise DemoError(

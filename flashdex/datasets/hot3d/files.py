@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from flashdex.datasets.files import refuse_pointer, told
-from flashdex.errors import DemoError
+from flashdex.datasets.files import read_text, told
+from flashdex.errors import DemoError, is_of_machine
 from flashdex.keys import SIDES, Side
 
 POSE_HEADER = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m]"
@@ -119,8 +119,7 @@ def _cells(file: Path, line: int) -> AbstractContextManager[None]:
 def read_lines(file: Path) -> list[str]:
     """Lines of a text file; where it is missing, the message lists what is there."""
     try:
-        refuse_pointer(file)
-        return file.read_text(encoding="utf-8").splitlines()
+        return read_text(file).splitlines()
     except FileNotFoundError as error:
         found = ", ".join(sorted(p.name for p in file.parent.glob("*"))) or "nothing"
         raise DemoError(
@@ -129,6 +128,8 @@ def read_lines(file: Path) -> list[str]:
             code="E_FILE",
         ) from error
     except (OSError, UnicodeDecodeError) as error:
+        if is_of_machine(error):
+            raise
         raise DemoError(f"{file}: not readable as text: {error}") from error
 
 

@@ -37,7 +37,7 @@ from flashdex.datasets.hot3d.world import (
     refuse_without_truth,
     up_axis,
 )
-from flashdex.datasets.roots import relative, shown
+from flashdex.datasets.roots import listed, relative, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.errors import DemoError
 
@@ -88,7 +88,7 @@ def _find_sequences(root: Path) -> list[Path]:
         folder.name: folder
         for group in groups
         if group.is_dir()
-        for folder in sorted(group.iterdir())
+        for folder in listed(group, "*")
         if _is_sequence(folder)
     }
     return [found[name] for name in sorted(found)]
@@ -122,7 +122,7 @@ def _wrong_root(root: Path) -> str:
 
 def _sequence_files(folder: Path) -> tuple[Path, ...]:
     names = [OBJECTS_FILE, HEADSET_FILE, METADATA_FILE]
-    hands = sorted(folder.glob("*_hand_*.json*"))
+    hands = listed(folder, "*_hand_*.json*")
     masks = [_mask_file(folder, name) for name in MASKS]
     files = [*(folder / name for name in names), *hands, *masks]
     return tuple(file for file in files if file.is_file())

@@ -12,6 +12,7 @@ import numpy as np
 from flashdex.datasets.demo import DemoObject
 from flashdex.datasets.files import read_json, refuse_clone, refuse_pointer, told
 from flashdex.datasets.hot3d.files import FrameAxis, Track, read_lines
+from flashdex.datasets.roots import listed, on_disk
 from flashdex.errors import DemoError
 
 Up = Literal["z", "y"]
@@ -136,7 +137,7 @@ class ObjectLibrary:
 
     def mesh(self, uid: str) -> Path:
         """Where the model of an object lies, whether or not it is there."""
-        return self.folder / f"{uid}.glb"
+        return on_disk(self.folder / f"{uid}.glb")
 
     def names(self) -> dict[str, str]:
         """Name of each object by uid; empty without ``instance.json``."""
@@ -150,7 +151,7 @@ class ObjectLibrary:
 
     def key(self) -> str:
         """Names and sizes of all models, as text: changes when one is added."""
-        models = [f for f in sorted(self.folder.glob("*.glb")) if f.is_file()]
+        models = [f for f in listed(self.folder, "*.glb") if f.is_file()]
         return " ".join(f"{file.name}:{file.stat().st_size}" for file in models)
 
 
@@ -162,12 +163,12 @@ def find_library(root: Path, given: Path | None) -> ObjectLibrary:
         above = [root, *list(root.resolve().parents)[:2]]
         places = [folder / name for folder in above for name in LIBRARY_NAMES]
     for folder in places:
-        models = sorted(folder.glob("*.glb"))
+        models = listed(folder, "*.glb")
         if models:
             refuse_clone(models[:1])
             return ObjectLibrary(folder)
     sought = ", ".join(str(place) for place in places)
-    archives = sorted(p.name for p in (given or root).glob("*.zip"))
+    archives = [p.name for p in listed(given or root, "*.zip")]
     unpack = f" Unpack {', '.join(archives[:3])} first." if archives else ""
     raise DemoError(
         f"{given or root}: no object models: <uid>.glb and {INSTANCES}. "

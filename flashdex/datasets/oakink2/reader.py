@@ -36,7 +36,7 @@ from flashdex.datasets.oakink2.annotation import (
     read_annotation,
     read_program,
 )
-from flashdex.datasets.roots import relative, require_folders
+from flashdex.datasets.roots import listed, relative, require_folders
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.support import estimate_support
 from flashdex.datasets.tracks import transform_pose
@@ -214,7 +214,7 @@ def list_oakink2(options: SourceOptions) -> list[Recording]:
     models = mano_pair(mano)
     sequences = [
         OakInk2Sequence(root=root, token=file.stem, mesh_folders=folders, mano=mano)
-        for file in sorted((root / ANNOTATIONS).glob("*.pkl"))
+        for file in listed(root / ANNOTATIONS, "*.pkl")
     ]
     if sequences:
         refuse_clone([sequences[0].annotation])  # a clone of pointers: all are
@@ -250,7 +250,9 @@ def _files(sequence: OakInk2Sequence) -> list[Path]:
         files.append(sequence.program)
         names = _program_objects(sequence.program)
     if not names:
-        each = [entry for place in sequence.mesh_folders for entry in place.iterdir()]
+        each = [
+            entry for place in sequence.mesh_folders for entry in listed(place, "*")
+        ]
         names = {entry.name for entry in each if entry.is_dir()}
     for name in sorted(names):
         with suppress(DemoError):  # reading tells, if the sequence needs it

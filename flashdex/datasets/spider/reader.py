@@ -20,7 +20,7 @@ import numpy as np
 from flashdex.datasets.demo import QUAT_TOLERANCE, DemoObject, HumanDemo
 from flashdex.datasets.fields import number, numbers
 from flashdex.datasets.files import load_npz, read_json, refuse_clone
-from flashdex.datasets.roots import find_mesh, mesh_in, shown
+from flashdex.datasets.roots import find_mesh, listed_below, mesh_in, shown
 from flashdex.datasets.source import Recording, Source, SourceOptions
 from flashdex.datasets.spider.hand import fill_hand
 from flashdex.datasets.tracks import FARTHEST, same_track
@@ -137,7 +137,7 @@ JOINT_KEYS = {"qpos_pip_{}": (2, 6, 10, 14, 18), "qpos_dip_{}": (3, 7, 11, 15, 1
 def list_spider(options: SourceOptions) -> list[Recording]:
     """All references below a folder, or one file, in path order."""
     path = options.folder("path")
-    files = [path] if path.is_file() else sorted(path.rglob(FILE))
+    files = [path] if path.is_file() else listed_below(path, FILE)
     if not files:
         raise DemoError(
             f"{path}: no {FILE}. Found: {shown(path)}. Give "

@@ -50,12 +50,13 @@ class Physics(ABC):
         physics: PhysicsConfig,
         num_envs: int,
         device: torch.device,  # where states live
+        scenes: list[Scene] | None = None,  # of ``build_scenes``, where they are built
     ) -> None:
         self.num_envs, self.device = num_envs, device
         self.decimation = physics.decimation  # substeps of a control step
         self.step_dt = physics.timestep * physics.decimation  # control step, s
         # of each motion, of one layout
-        self.scenes: list[Scene] = build_scenes(library, hands, physics)
+        self.scenes = scenes or build_scenes(library, hands, physics)
         self.map = StateMap(library, hands, self.scenes[0]).to(device)
         self._motion = torch.zeros(num_envs, dtype=torch.long, device=device)
 

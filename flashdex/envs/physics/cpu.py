@@ -44,8 +44,9 @@ class CpuPhysics(Physics):
         hands: dict[keys.Side, HandSpec],
         physics: PhysicsConfig,
         num_envs: int,
+        scenes: list[Scene] | None = None,
     ) -> None:
-        super().__init__(library, hands, physics, num_envs, torch.device("cpu"))
+        super().__init__(library, hands, physics, num_envs, torch.device("cpu"), scenes)
         scene = self.scenes[0]
         self.layout = layout = scene.layout
         self.batch = Batch(scene.model, nsim=num_envs, nthread=physics.num_threads)

@@ -9,6 +9,7 @@ import torch
 from flashdex import keys
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.physics.cpu import CpuPhysics
+from flashdex.envs.scene.scene import Scene
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 
@@ -53,20 +54,24 @@ def make_physics(
     hands: dict[keys.Side, HandSpec],
     physics: PhysicsConfig,
     num_envs: int,
+    scenes: list[Scene] | None = None,
 ) -> Physics:
     """Build the engine that ``physics.engine`` names.
+
+    ``scenes`` are those of ``build_scenes`` where they are built already: of a large
+    collection they are most of the work.
 
     Raises:
         FlashdexError: its packages are missing, or it cannot run this collection.
     """
     match physics.engine:
         case "cpu":
-            return CpuPhysics(library, hands, physics, num_envs)
+            return CpuPhysics(library, hands, physics, num_envs, scenes)
         case "warp":
             from flashdex.envs.physics.warp.engine import WarpPhysics
 
-            return WarpPhysics(library, hands, physics, num_envs)
+            return WarpPhysics(library, hands, physics, num_envs, scenes)
         case "brax":
             from flashdex.envs.physics.brax.engine import BraxPhysics
 
-            return BraxPhysics(library, hands, physics, num_envs)
+            return BraxPhysics(library, hands, physics, num_envs, scenes)

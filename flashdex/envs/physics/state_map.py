@@ -54,9 +54,9 @@ class StateMap(nn.Module):
             "ctrl_of_joint": _stack([scene.joint_actuator(s) for s in layout.sides]),
             "qpos_of_object": _stack([scene.object_qpos(s) for s in slots], 7),
             "dof_of_object": _stack([scene.object_dof(s) for s in slots], 6),
-            "active": library.motions["hand_active"].bool().as_subclass(Tensor),
-            "has_object": (rows >= 0).as_subclass(Tensor),
-            "own_slot": slot.clamp_min(0).as_subclass(Tensor),
+            "active": library.motions["hand_active"].bool(),
+            "has_object": rows >= 0,
+            "own_slot": slot.clamp_min(0),
             "parked": torch.as_tensor(parked),
             "empty": torch.tensor(empty, dtype=torch.float64).reshape(-1, 7),
         }

@@ -25,7 +25,7 @@ OBJECT_BITS = (2, 3)
 _GRAIN = 1e-3  # m, radius of a geom that fills an unused place
 # m; with its mass centre off the origin a body is never "simple", so that all scenes
 # have the same inertia structure
-_OFFSET = 1e-5
+INERTIA_OFFSET = 1e-5
 _SENSOR_DATA = 2 | 16  # bits of mjSENS_CONTACT: net force and position
 _NET_FORCE = 3  # reduction: one wrench at the force-weighted point, world axes
 
@@ -122,7 +122,7 @@ def add_object_of_meshes(
     body = spec.worldbody.add_body(name=f"object{slot}")
     body.add_freejoint(name=f"object{slot}")
     body.explicitinertial = True
-    body.mass, body.inertia, body.ipos = 0.01, [1e-5] * 3, [_OFFSET] * 3
+    body.mass, body.inertia, body.ipos = 0.01, [1e-5] * 3, [INERTIA_OFFSET] * 3
     for i, mesh in enumerate(meshes):
         _add_part(body, f"object{slot}_part{i}", mesh, slot, physics)
 
@@ -131,12 +131,12 @@ def _set_inertia(body: mujoco.MjsBody, library: MotionLibrary, row: int) -> None
     body.explicitinertial = True
     if row < 0:
         body.mass, body.inertia, body.gravcomp = 0.01, [1e-5] * 3, 1.0
-        body.ipos = [_OFFSET] * 3
+        body.ipos = [INERTIA_OFFSET] * 3
         return
     objects = library.objects
     inertia = objects["inertia"][row].double().numpy()
     body.mass = float(objects["mass"][row])
-    body.ipos = objects["com"][row].double().numpy() + _OFFSET
+    body.ipos = objects["com"][row].double().numpy() + INERTIA_OFFSET
     order = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     body.fullinertia = [inertia[i, j] for i, j in order]
 

@@ -33,6 +33,7 @@ from flashdex.motions.library import MotionLibrary
 if TYPE_CHECKING:
     from flashdex.envs.physics.config import PhysicsConfig
 
+MAX_PADDING = 100_000  # bounding volumes; scenes of real collections differ by hundreds
 PARKED = {"left": (-4.0, 0.0, 3.0), "right": (4.0, 0.0, 3.0)}  # m, idle hands
 
 
@@ -127,6 +128,32 @@ def build_scenes(
     for spec, count in zip(specs, nodes, strict=True):
         pad_bvh(spec, max(nodes) - count)
     return [Scene(_to_xml(spec), layout, hands) for spec in specs]
+
+
+def rebuild_scene(
+    library: MotionLibrary,
+    motion: int,
+    hands: dict[keys.Side, HandSpec],
+    physics: PhysicsConfig,
+    layout: SceneLayout,
+    *,
+    nodes: int,
+) -> Scene:
+    """One scene of a collection anew, without the others.
+
+    Args:
+        library: selected motions, as for ``build_scenes``.
+        motion: row.
+        hands: specs by side.
+        physics: settings.
+        layout: of the whole collection.
+        nodes: bounding volumes that the scene has, where it has that many; the largest
+            scene of its collection says how many.
+    """
+    spec = _make_spec(library, motion, hands, physics, layout)
+    own = mujoco.MjModel.from_xml_string(_to_xml(spec)).nbvh
+    pad_bvh(spec, max(0, min(nodes - own, MAX_PADDING)))
+    return Scene(_to_xml(spec), layout, hands)
 
 
 def _to_xml(spec: mujoco.MjSpec) -> str:

@@ -214,6 +214,7 @@ def _check_acceleration(motion: Interaction) -> list[Finding]:
 
 WRONG = 0.02  # m: an axis whose table is violated by more is doubtful
 RIGHT = 0.01  # m: the table of the suggested axis is violated by less
+SURE = 0.1  # share of the fault that the table of another axis may have
 RISE = 0.05  # m that something rises from the table, or the axis proves nothing
 AXES = {f"+{'xyz'[i]}": axis for i, axis in enumerate(np.eye(3))}
 AXES |= {f"-{'xyz'[i]}": -axis for i, axis in enumerate(np.eye(3))}
@@ -238,10 +239,12 @@ def check_up(
     if not any(rest):
         return []
     fault, _ = _table(poses, vertices, rest, AXES["+z"])
-    if fault <= WRONG:
+    if fault <= RIGHT:
         return []
     tables = {name: _table(poses, vertices, rest, axis) for name, axis in AXES.items()}
-    better = {n: f for n, (f, rise) in tables.items() if f < RIGHT and rise > RISE}
+    # a smaller fault needs a table that is better beyond doubt
+    right = RIGHT if fault > WRONG else SURE * fault
+    better = {n: f for n, (f, rise) in tables.items() if f < right and rise > RISE}
     if not better:
         return []
     name = min(better, key=better.__getitem__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flashdex.datasets.demo import MAX_SECONDS, MIN_SECONDS, HumanDemo
-from flashdex.datasets.tracks import rotation
+from flashdex.datasets.tracks import missing_frames, palm_frame, rotation
 from flashdex.motions.findings import Finding, reject, warn
 from flashdex.motions.repair.jumps import JUMP_EVENTS, jump_steps
 from flashdex.motions.repair.repair import FILLED
@@ -19,6 +19,11 @@ KNUCKLES, TIPS = [5, 9, 13, 17], [8, 12, 16, 20]
 # m, mean of the tips out of the palm, to where fingers bend: recorded hands 0.029 to
 # 0.067, so a hand of the wrong side has the negative of that
 BENT_BACK = -0.01
+# MANO's order: index, middle, pinky, ring, thumb, three joints each, then the tips
+FROM_MANO = [0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20]
+CHAIN = 1.5  # bones in a wrong order are longer by this
+WRONG_TURN, RIGHT_TURN = np.deg2rad(45), np.deg2rad(30)  # of a palm, from its points
+HELD_SHARE, HELD_STEPS = 0.8, 8  # of the changes that are equally far apart; at least
 
 
 def check_demo(demo: HumanDemo) -> list[Finding]:
@@ -39,9 +44,40 @@ def check_demo(demo: HumanDemo) -> list[Finding]:
     for side, points in demo.keypoints.items():
         length = float(np.median(np.linalg.norm(points[:, 9] - points[:, 0], axis=-1)))
         if not PALM_LENGTH[0] < length < PALM_LENGTH[1]:
-            text = f"{side} wrist to middle MCP {length:.3f} m; are these metres?"
-            found.append(reject("E_UNIT", text))
-    return found + _check_travel(demo) + _check_missing(demo)
+            text = f"{side} wrist to middle MCP {length:.3f} m; "
+            hint = "are these metres?"
+            if _is_mano_order(points):
+                hint = "are the joints in MANO's order? Wrist, then thumb to pinky, "
+                hint += "from the palm outwards, four each, are needed"
+            found.append(reject("E_UNIT", text + hint))
+    return found + _check_travel(demo) + _check_missing(demo) + _check_held(demo)
+
+
+def _is_mano_order(points: np.ndarray) -> bool:
+    """Whether keypoints (T, 21, 3) make hands in MANO's order, and none in ours."""
+
+    def longest(points: np.ndarray) -> float:
+        fingers = points[:, 1:].reshape(-1, 5, 4, 3)
+        bones = np.linalg.norm(np.diff(fingers, axis=2), axis=-1)
+        return float(np.median(bones, axis=0).max())
+
+    return longest(points) > CHAIN * longest(points[:, FROM_MANO])
+
+
+def _check_held(demo: HumanDemo) -> list[Finding]:
+    """Frames that stand several times: a lower rate, spread over a higher one."""
+    tracks = [*demo.keypoints.values(), *(b.pose for b in demo.objects)]
+    flat = np.concatenate([t.reshape(len(t), -1) for t in tracks], axis=1)
+    changes = np.flatnonzero((np.abs(np.diff(flat, axis=0)) > 1e-9).any(axis=1))
+    apart = np.diff(changes)
+    if len(apart) < HELD_STEPS:
+        return []
+    times = int(np.bincount(apart).argmax())
+    if times < 2 or (apart == times).mean() < HELD_SHARE:
+        return []
+    text = f"every frame stands {times} times: recorded at {demo.fps / times:g} frames "
+    text += f"a second, not {demo.fps:g}? Give each once, with that fps"
+    return [warn("W_HELD", text)]
 
 
 def _check_travel(demo: HumanDemo) -> list[Finding]:
@@ -82,11 +118,33 @@ def check_sides(demo: HumanDemo) -> list[Finding]:
     """Fingers that bend out of the back of the hand: it is the other hand."""
     found = []
     for side, points in demo.keypoints.items():
+        if _is_scalar_last(demo.palm[side], palm_frame(points, side)):
+            text = f"the {side} palm's quaternions are xyzw; wxyz are needed"
+            found.append(reject("E_ROT", text))
+            continue
         out_of_palm = rotation(demo.palm[side][:, 3:]).as_matrix()[..., 2]
         fingers = points[:, TIPS] - points[:, KNUCKLES]
         bend = float(np.einsum("ti,tfi->tf", out_of_palm, fingers).mean())
         if not bend > BENT_BACK:
+            if _is_mano_order(points):
+                text = f"the {side} hand's joints are in MANO's order; wrist, then "
+                text += "thumb to pinky, from the palm outwards, are needed"
+                found.append(reject("E_SIDE", text))
+                continue
             text = f"the {side} hand's fingers bend {-100 * bend:.0f} cm out of its "
             text += "back; are left and right swapped, or is the world mirrored?"
             found.append(reject("E_SIDE", text))
     return found
+
+
+def _is_scalar_last(given: np.ndarray, seen: np.ndarray) -> bool:
+    """Whether palms (T, 7) fit to those of the keypoints only as x, y, z, w."""
+    known = ~missing_frames(given, seen)
+    if not known.any():
+        return False
+    back = rotation(seen[known, 3:]).inv()
+    off, rolled = (
+        float(np.median((rotation(quats) * back).magnitude()))
+        for quats in (given[known, 3:], np.roll(given[known, 3:], 1, axis=1))
+    )
+    return off > WRONG_TURN and rolled < RIGHT_TURN

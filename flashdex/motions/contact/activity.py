@@ -9,10 +9,8 @@ import trimesh
 from scipy.ndimage import uniform_filter1d
 
 from flashdex.datasets.demo import HumanDemo
-from flashdex.datasets.support import STILL_SPEED, STILL_TURN
+from flashdex.datasets.support import STILL_SPEED, STILL_TURN, speeds
 from flashdex.datasets.tracks import (
-    angular_velocity,
-    linear_velocity,
     missing_frames,
     rotation,
     runs,
@@ -52,14 +50,14 @@ def find_activity(demo: HumanDemo, meshes: list[trimesh.Trimesh]) -> Activity:
     near = np.stack([nearest_tips(points, p, mesh) for p, mesh in pairs], axis=1)
     touch = np.stack([[touches(row) for row in hand] for hand in near])
     held = [busy_with(n, t, demo.fps) for n, t in zip(near, touch, strict=True)]
-    speeds = [_speeds(pose, demo.fps) for pose in poses]
-    moving = [_moves(p, s) for p, s in zip(poses, speeds, strict=True)]
+    pairs = [_speeds(pose, demo.fps) for pose in poses]
+    moving = [_moves(p, s) for p, s in zip(poses, pairs, strict=True)]
     return Activity(
         sides=sides,
         touch=touch,
         held=np.stack(held),
         moving=np.stack(moving),
-        pace=np.stack([np.nan_to_num(s[:, 0]) for s in speeds]),
+        pace=np.stack([np.nan_to_num(s[:, 0]) for s in pairs]),
         hand_seen=np.stack([~missing_frames(p) for p in points]),
         object_seen=np.stack([~missing_frames(p) for p in poses]),
     )
@@ -130,13 +128,10 @@ def bridge(mask: np.ndarray, fps: float) -> np.ndarray:
 
 def _speeds(pose: np.ndarray, fps: float) -> np.ndarray:
     """Linear (m/s) and angular speed (rad/s), NaN where not tracked, (T, 2)."""
-    speeds = np.full((len(pose), 2), np.nan)
+    found = np.full((len(pose), 2), np.nan)
     for a, b in runs(~missing_frames(pose), least=3):
-        straight = linear_velocity(pose[a:b, :3], fps, sigma=1.0)
-        turning = angular_velocity(pose[a:b, 3:], fps, sigma=1.0)
-        speeds[a:b, 0] = np.linalg.norm(straight, axis=-1)
-        speeds[a:b, 1] = np.linalg.norm(turning, axis=-1)
-    return speeds
+        found[a:b] = np.column_stack(speeds(pose[a:b], fps))
+    return found
 
 
 def _moves(pose: np.ndarray, speeds: np.ndarray) -> np.ndarray:

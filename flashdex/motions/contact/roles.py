@@ -23,7 +23,7 @@ from flashdex.motions.contact.fingertips import (
     contact_runs,
     tip_distances,
 )
-from flashdex.motions.library import NUM_OBJECT_SLOTS
+from flashdex.motions.library_format import NUM_OBJECT_SLOTS
 
 NO_OBJECT = 10.0  # m, tip distance of a hand without object
 MEET = 0.01  # m between the surfaces of two objects

@@ -22,6 +22,7 @@ from flashdex.datasets.source import Recording
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.pipeline.motion import MotionSettings, Prepared
 from flashdex.objects.asset import DAMAGED, read_object
+from flashdex.system.archives import read_npz
 from flashdex.system.files import hash_file, open_atomic
 
 logger = logging.getLogger(__name__)
@@ -99,18 +100,25 @@ def read_prepared(file: Path, root: Path) -> list[Prepared] | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            entries = json.loads(str(stored["entries"]))
-            records = [_read_record(stored, i, e, root) for i, e in enumerate(entries)]
-            pairs = zip(records, entries, strict=True)
-            return [Prepared(record, entry["row"]) for record, entry in pairs]
+        stored = read_npz(file)
+        entries = json.loads(str(stored["entries"]))
+        records = [_read_record(stored, i, e, root) for i, e in enumerate(entries)]
+        pairs = zip(records, entries, strict=True)
+        return [Prepared(record, _row_of(entry)) for record, entry in pairs]
     except DAMAGED as error:
         logger.warning("%s: unreadable (%s); preparing the motion again", file, error)
         return None
 
 
+def _row_of(entry: dict[str, Any]) -> dict[str, Any]:
+    row = entry["row"]
+    if not all(isinstance(row[key], str) for key in ("motion", "status", "reason")):
+        raise ValueError("a row without motion, status or reason")
+    return row
+
+
 def _read_record(
-    stored: Any, row: int, entry: dict[str, Any], root: Path
+    stored: dict[str, np.ndarray], row: int, entry: dict[str, Any], root: Path
 ) -> MotionRecord | None:
     fields = entry["record"]
     if fields is None:
@@ -123,7 +131,7 @@ def _read_record(
         objects.append(asset)
     fields["objects"] = objects
     fields["frames"], fields["quality"] = {}, {}
-    for key in stored.files:
+    for key in stored:
         words = key.split("/")
         if words[0] == str(row) and len(words) == 3:
             fields[words[1]][words[2]] = stored[key]

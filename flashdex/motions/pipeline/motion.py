@@ -37,6 +37,7 @@ from flashdex.motions.findings import (
 )
 from flashdex.motions.frames import make_record
 from flashdex.motions.library_writer import MotionRecord
+from flashdex.motions.repair.objects import settle_objects
 from flashdex.motions.repair.repair import repair
 from flashdex.motions.repair.segment import segment
 from flashdex.motions.retarget.residuals import RetargetWeights
@@ -89,6 +90,7 @@ class Prepared:
 
     record: MotionRecord | None
     row: dict[str, Any]
+    passing: bool = False  # memory or a disk failed: another time it may go well
 
 
 def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
@@ -110,11 +112,12 @@ def _prepare_pieces(demo: HumanDemo, settings: MotionSettings) -> list[Prepared]
     if settings.speed != 1.0:
         told = demo.provenance | {"speed": settings.speed}
         demo = replace(demo, fps=demo.fps * settings.speed, provenance=told)
+    demo, remarks = settle_objects(demo)
     demo.validate(complete=False)
     long = demo.needs_cutting or demo.seconds > MAX_SECONDS
     is_cut = settings.cut == "always" or (settings.cut == "auto" and long)
     pieces, findings = repair(demo, keep_gaps=is_cut)
-    findings += of_reader(demo)
+    findings += remarks + of_reader(demo)
     if is_cut and pieces:
         pieces, remarks = segment(pieces[0])
         findings += remarks
@@ -133,7 +136,8 @@ def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
         return make()
     except Exception as error:  # what no check foresaw must not end the others
         logger.debug("%s", name, exc_info=True)
-        return [rejected(name, [of_error(error)])]
+        item = rejected(name, [of_error(error)])
+        return [replace(item, passing=isinstance(error, OSError | MemoryError))]
 
 
 def rejected(name: str, findings: list[Finding]) -> Prepared:

@@ -21,10 +21,15 @@ from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
 from flashdex.motions.findings import reject
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from flashdex.motions.library_writer import (
+    LibraryWriter,
+    MotionRecord,
+    check_target,
+)
 from flashdex.motions.pipeline.cache import cache_file, content_hash
 from flashdex.motions.pipeline.motion import MotionSettings, rejected
 from flashdex.motions.pipeline.workers import Job, Outcome, run_jobs
+from flashdex.system.names import file_stem, plain_name
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r")  # what begins one in a spreadsheet
 _LOG = logging.getLogger(__name__)
@@ -73,7 +78,9 @@ def run_order(
         4
     """
     settings = order.settings
-    load_hand(settings.hand)  # refuses an unknown name before anything is read
+    # refused before anything is read
+    load_hand(settings.hand)
+    check_target(Path(out))
     listed = order.recordings()
     recordings, doubles = _without_doubles(listed)
     jobs = [Job(recording, settings) for recording in recordings]
@@ -149,17 +156,25 @@ def _facts(
 
 
 def _records(outcomes: list[Outcome], root: Path) -> Iterator[MotionRecord]:
-    """Kept motions, one in memory at a time; equal names get a number."""
-    names: Counter[str] = Counter()
+    """Kept motions, one in memory at a time; names that would meet get a number."""
+    taken: set[str] = set()
     for outcome in outcomes:
         for item, row in zip(outcome.load(root), outcome.rows, strict=True):
             if item.record is None:
                 continue
-            names[item.record.name] += 1
-            if names[item.record.name] > 1:
-                name = f"{item.record.name}_{names[item.record.name]}"
-                item.record, row["motion"] = replace(item.record, name=name), name
+            name = _free_name(item.record.name, taken)
+            item.record, row["motion"] = replace(item.record, name=name), name
             yield item.record
+
+
+def _free_name(wanted: str, taken: set[str]) -> str:
+    """A name whose files are those of no other, on any file system."""
+    name, count = plain_name(wanted), 1
+    while (stem := file_stem(name).casefold()) in taken:
+        count += 1
+        name = f"{plain_name(wanted, limit=240)}_{count}"
+    taken.add(stem)
+    return name
 
 
 def _refuse_empty(rows: list[dict[str, Any]], out: str | Path) -> None:

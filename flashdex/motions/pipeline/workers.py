@@ -32,7 +32,7 @@ from flashdex.motions.pipeline.motion import (
     prepare_recording,
     rejected,
 )
-from flashdex.objects.meshes import MESH_SUFFIXES
+from flashdex.objects.mesh_files import MESH_SUFFIXES
 
 _LOG = logging.getLogger(__name__)
 
@@ -88,7 +88,8 @@ def run_job(job: Job, *, carry: bool = False) -> Outcome:
     is_kept = prepared is not None
     if prepared is None:
         prepared = prepare_recording(job.recording, job.settings)
-        write_prepared(file, prepared)
+        if not any(item.passing for item in prepared):
+            write_prepared(file, prepared)
         # a disk that refuses the motions or their objects must not cost them
         is_kept = not carry and read_prepared(file, root) is not None
     rows = [item.row for item in prepared]

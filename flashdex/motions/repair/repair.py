@@ -30,11 +30,12 @@ from flashdex.datasets.tracks import (
     short_gaps,
 )
 from flashdex.errors import MeshError
-from flashdex.keys import Side
+from flashdex.keys import FINGERS, Side
 from flashdex.motions.findings import Finding, info, reject, status_of, warn
 from flashdex.motions.repair.jumps import JUMP_EVENTS, outliers
 
 QUAT_LIMIT = 0.1  # a quaternion farther off is no rotation
+HALF_SEEN = 0.1  # share of frames with single points missing that is told
 LEAST_TRACKED = 0.2  # share of frames below which a track is not worth keeping
 
 FILLED = "filled"  # key of the provenance: tracks with the frames made up for them
@@ -59,7 +60,7 @@ def repair(
     """
     if keep_gaps is None:
         keep_gaps = demo.needs_cutting or demo.seconds > MAX_SECONDS
-    found: list[Finding] = []
+    found = _tell_half_seen(demo)
     demo = _drop(_blank(demo), 0.0, found)
     found += _check_quats(demo)
     if status_of(found) == "rejected":
@@ -84,6 +85,29 @@ def _blank(demo: HumanDemo) -> HumanDemo:
         for b in demo.objects
     ]
     return replace(demo, keypoints=keypoints, palm=palm, objects=objects)
+
+
+def _tell_half_seen(demo: HumanDemo) -> list[Finding]:
+    """Hands that count as not tracked because single points of theirs are missing."""
+    found = []
+    for side, points in demo.keypoints.items():
+        gone = np.asarray(~np.isfinite(points).all(axis=2))
+        half = np.asarray(gone.any(axis=1) & ~gone.all(axis=1))
+        if half.sum() <= HALF_SEEN * len(half):
+            continue
+        often = gone[half].mean(axis=0)
+        usual = np.flatnonzero(often > 0.5 * often.max()).tolist()
+        names = [_point_name(i) for i in usual]
+        text = f"{side} hand: {', '.join(names[:5])} missing in {half.sum()} frames in "
+        text += "which the rest is tracked: the whole hand counts as not tracked there"
+        found.append(info("E_NAN", text))
+    return found
+
+
+def _point_name(index: int) -> str:
+    finger, joint = divmod(index - 1, 4)
+    part = "tip" if joint == 3 else f"joint {joint + 1}"
+    return f"keypoint {index} ({FINGERS[finger]} {part})" if index else "keypoint 0"
 
 
 def _missing(*tracks: np.ndarray) -> np.ndarray:

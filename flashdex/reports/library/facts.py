@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections import Counter
@@ -14,7 +15,9 @@ from typing import Any
 from flashdex.errors import LibraryError
 from flashdex.motions.checks.aligned import IK_P95, REFERENCE_DEPTH, TIP_DEPTH
 from flashdex.motions.library import MotionLibrary
+from flashdex.system.files import open_plain
 
+MAX_REPORT = 256 << 20  # bytes of report.csv that are read
 STATUSES = ("rejected", "flagged", "kept")
 # mm, from which on a figure flags a motion: W_IK, W_DEPTH, W_PEN
 LIMITS = {
@@ -29,6 +32,7 @@ CODES = {
     "E_FILE": "files that belong together are missing",
     "E_KEYS": "a key is missing or has a wrong shape",
     "E_LEN": "hands and objects have different numbers of frames",
+    "E_MACHINE": "memory or a disk failed; the same command tries it again",
     "E_MANO": "MANO files missing, wrong, or sides swapped",
     "E_MESH": "mesh missing, unreadable or without volume",
     "E_NAN": "frames not tracked: filled, cut around, or too many",
@@ -42,6 +46,8 @@ CODES = {
     "W_OBJECTS": "an object that moves was left out: two at most",
     "I_SIGN": "quaternion signs that flipped were set right",
     "R_BELOW": "object more than 5 cm below the table",
+    "W_HELD": "every frame stands several times: another rate",
+    "W_ORIGIN": "a mesh far from the origin of its frame was moved there",
     "E_SIDE": "fingers bend backwards: left and right swapped, or mirrored",
     "R_CONTACT": "the object moves, but no fingertip comes within 2 cm",
     "R_INACTIVE": "no hand touches an object, at all or for a time",
@@ -203,11 +209,13 @@ def _make(
 
 
 def _read_report(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
     try:
-        with path.open(encoding="utf-8", errors="replace", newline="") as file:
-            lines = list(csv.DictReader(file, restkey="", restval=""))
+        with open_plain(path) as file:
+            text = file.read(MAX_REPORT).decode("utf-8", errors="replace")
+        table = io.StringIO(text, newline="")
+        lines = list(csv.DictReader(table, restkey="", restval=""))
+    except FileNotFoundError:
+        return []
     except (OSError, csv.Error) as error:
         raise LibraryError(
             f"{path}: not a readable table ({error}). Prepare the library again."

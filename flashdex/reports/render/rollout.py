@@ -17,6 +17,7 @@ from flashdex.reports.render.films import Film
 from flashdex.reports.render.scene import ScenePainter, draw_each, update_poses
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import open_atomic
+from flashdex.system.mjcf import check_mjcf
 
 WIDTH, HEIGHT = 512, 384  # multiples of 16, as the encoder wants them
 FILM_FPS = 30.0
@@ -32,6 +33,7 @@ class Painter(ScenePainter):
         self.rollout = rollout
         self._moving = _moving_points(rollout)
         self._cameras: dict[float, mujoco.MjvCamera] = {}
+        check_mjcf(rollout.model_xml, where=rollout.motion)
         spec = mujoco.MjSpec.from_string(rollout.model_xml)
         super().__init__(spec, size=(WIDTH, HEIGHT), middle=rollout.num_frames // 2)
         self._ghost = mujoco.MjData(self.model)

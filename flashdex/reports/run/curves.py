@@ -26,26 +26,36 @@ def conversion_charts(
     run: RunData, facts: list[MotionFacts], *, total: int
 ) -> list[Markup]:
     """Cumulative conversions over env steps and time; the axis ends at the total."""
-    lines = sorted((f.first for f in facts if f.first), key=lambda x: x["env_steps"])
     unit, seconds = ("hours", 3600.0)
     if run.wall_s < MINUTES_BELOW_S:
         unit, seconds = ("minutes", 60.0)
-    counts = [0.0, *map(float, range(1, len(lines) + 1)), float(len(lines))]
+    passed = [f for f in facts if f.first]
+    groups = {"converted": [f for f in passed if not f.trivial]}
+    if len(passed) > len(groups["converted"]):
+        groups["and trivial"] = passed
 
-    def chart(xs: list[float], end: float, label: str) -> Markup:
+    def chart(key: str, scale: float, end: float, label: str) -> Markup:
         return line_chart(
-            [Series("converted", [0.0, *xs, max([end, *xs])], counts)],
+            [_steps(name, found, key, scale, end) for name, found in groups.items()],
             title="Converted motions",
             x_label=label,
             is_step=True,
             y_range=(0.0, float(max(total, 1))),
         )
 
-    times = [line["wall_s"] / seconds for line in lines]
     return [
-        chart([line["env_steps"] for line in lines], run.env_steps, STEPS),
-        chart(times, run.wall_s / seconds, f"{unit} of training"),
+        chart("env_steps", 1.0, run.env_steps, STEPS),
+        chart("wall_s", seconds, run.wall_s / seconds, f"{unit} of training"),
     ]
+
+
+def _steps(
+    name: str, facts: list[MotionFacts], key: str, scale: float, end: float
+) -> Series:
+    """How many motions were converted by when."""
+    xs = sorted(f.first[key] / scale for f in facts if f.first)
+    counts = [0.0, *map(float, range(1, len(xs) + 1)), float(len(xs))]
+    return Series(name, [0.0, *xs, max([end, *xs])], counts)
 
 
 def learning_charts(run: RunData) -> list[tuple[str, list[Markup]]]:

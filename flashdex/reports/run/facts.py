@@ -151,6 +151,8 @@ SHOWN = {
     "object_pos": ("object", "mm", 1e3),
     "object_pos_centred": ("object centred", "mm", 1e3),
     "object_rot": ("object", "deg", 57.29577951308232),
+    "lift": ("lift off by", "x", 1.0),
+    "path": ("path off by", "x", 1.0),
     "fingertip": ("fingertips", "mm", 1e3),
     "joint": ("joints", "mm", 1e3),
     "wrist_pos": ("wrists", "mm", 1e3),
@@ -173,8 +175,21 @@ class MotionFacts:
 
     @cached_property
     def first(self) -> Line | None:
-        """Ledger line of the first conversion."""
-        return next((line for line in self.lines if line.get("converted")), None)
+        """Ledger line of the first conversion; one that is not trivial, if any."""
+        passed = [line for line in self.lines if line.get("converted")]
+        real = (line for line in passed if not line.get("trivial"))
+        return next(real, passed[0] if passed else None)
+
+    @property
+    def ratios(self) -> tuple[float | None, float | None]:
+        """Lift and path of the object over those of the recording, of ``errors``."""
+        line = self.first or self._best or {}
+        return line.get("lift_ratio"), line.get("path_ratio")
+
+    @cached_property
+    def _best(self) -> Line | None:
+        found = [line for line in self.lines if line.get("errors")]
+        return min(found, key=lambda line: _error_size(line["errors"]), default=None)
 
     @property
     def is_converted(self) -> bool:
@@ -184,10 +199,7 @@ class MotionFacts:
     @cached_property
     def errors(self) -> dict[str, float]:
         """Of the first conversion, else of the best complete attempt; m and rad."""
-        if self.first:
-            return self.first["errors"]
-        found = [line["errors"] for line in self.lines if line.get("errors")]
-        return min(found, key=_error_size, default={})
+        return (self.first or self._best or {}).get("errors", {})
 
     @property
     def hands(self) -> tuple[str, ...]:
@@ -201,11 +213,11 @@ class MotionFacts:
 
     @property
     def trivial(self) -> list[str]:
-        """Baselines without learning that pass already."""
+        """Why a conversion counts for little: baselines that pass, hardly a motion."""
         scores = self.baselines.items()
         criterion = self.run.criterion
         passing = [b for b, row in scores if criterion in row.get("passed", [])]
-        named = [b for line in self.lines for b in line.get("trivial") or []]
+        named = (self.first or {}).get("trivial") or []
         return list(dict.fromkeys([*passing, *named]))
 
     @property
@@ -291,13 +303,14 @@ def num_motions(run: RunData, facts: list[MotionFacts]) -> int:
 
 
 def count(facts: list[MotionFacts]) -> dict[str, int]:
-    """Converted motions, and how many of them are certified, robust, trivial."""
-    converted = [f for f in facts if f.is_converted]
+    """Conversions that are not trivial, how many of them hold, and trivial ones."""
+    passed = [f for f in facts if f.is_converted]
+    converted = [f for f in passed if not f.trivial]
     return {
         "converted": len(converted),
         "certified": sum(f.verdict in PROVEN for f in converted),
         "robust": sum(f.verdict == "robust" for f in converted),
-        "trivial": sum(bool(f.trivial) for f in converted),
+        "trivial": len(passed) - len(converted),
         "attempts": sum(len(f.lines) for f in facts),
     }
 

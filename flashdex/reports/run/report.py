@@ -22,9 +22,9 @@ from flashdex.reports.run.facts import (
     num_motions,
 )
 from flashdex.reports.text import NOTHING, number
+from flashdex.rollouts.ledger import rollout_name
 from flashdex.system.files import own_file
-from flashdex.system.names import check_name
-from flashdex.system.run_files import REPORT, ROLLOUTS
+from flashdex.system.run_files import REPORT
 
 MAX_FILMS = 60  # inside the page; the files of all others lie in films/
 BASELINE_WORDS = {"do_nothing": "do nothing", "kinematic_playback": "playback"}
@@ -95,14 +95,12 @@ def _promises(run: RunData) -> list[str]:
 
 
 def _stored_rollouts(run: RunData, rows: list[MotionFacts]) -> dict[str, Path]:
-    """Rollout file of each conversion; a path that leaves the run is not followed."""
+    """Rollout file of each conversion, where its line names one: only its own."""
     found = {}
     for row in rows:
         named = (row.first or {}).get("rollout")
         if named:
-            path = own_file(
-                run.path, ROLLOUTS, check_name(Path(named).name, what="file")
-            )
+            path = own_file(run.path, rollout_name(row.name))
             if path.is_file():
                 found[row.name] = path
     return found
@@ -131,6 +129,8 @@ def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
         "env steps": (f"{first['env_steps']:,}" if first else NOTHING, ""),
         "minutes": (number(first["wall_s"] / 60) if first else NOTHING, ""),
         **errors,
+        "lift ratio": (number(row.ratios[0], 2), ""),
+        "path ratio": (number(row.ratios[1], 2), ""),
         "certificate": _verdict(row),
         "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
         "penetration mm": (number(depth), ""),

@@ -22,9 +22,11 @@ from flashdex.reports.run.facts import (
 )
 from flashdex.reports.run.report import write_report
 from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shorten
+from flashdex.rollouts.findings import Finding
 
 NAME_WIDTH = 20
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
+RATIOS = ("lift", "path")
 STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
 
 
@@ -47,9 +49,9 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  {_progress(run)}",
-        f"{counts['converted']}/{num_motions(run, rows)} converted by {run.criterion}, "
-        f"{counts['certified']} certified ({counts['robust']} robust), "
-        f"{counts['trivial']} trivial, {counts['attempts']:,} attempts",
+        f"{counts['converted']} of {num_motions(run, rows)} converted by "
+        f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust),"
+        f" and {counts['trivial']} trivial, {counts['attempts']:,} attempts",
     ]
 
 
@@ -69,6 +71,7 @@ def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
         "min": plain(first["wall_s"] / 60) if first else "-",
         "mm": _error(row.errors, "object_pos"),
         "deg": _error(row.errors, "object_rot"),
+        **{name: plain(r, 2) for name, r in zip(RATIOS, row.ratios, strict=True)},
         "proof": row.verdict or "-",
         "pert": "-" if share is None else f"{share:.0%}",
         "pen": plain(depth),
@@ -106,10 +109,12 @@ def _legend(run: RunData) -> list[str]:
         f"limits of {run.criterion}: {', '.join(limits) or 'none'}",
         "pert: share of perturbed replays that pass; pen: deepest contact, mm; "
         "N: largest force",
+        "lift, path: rise and path of the object over those of the recording",
     ]
     if run.baselines:
         lines.append(
-            "idle, playback: baselines without learning, mm/deg; *: one passes"
+            "idle, playback: baselines without learning, mm/deg; *: one passes, or the "
+            "object hardly moves"
         )
     return lines
 
@@ -119,17 +124,20 @@ def evaluation_table(
 ) -> str:
     """Scores of ``flashdex evaluate`` for a terminal.
 
-    Rows, one a motion, hold name, state of each criterion, errors in m and rad; the
-    totals hold counts of each criterion and mean errors.
+    Rows, one a motion, hold name, state of each criterion, mean object errors in mm and
+    rad, and ratios of movement; the totals hold counts of each criterion, and the means
+    of these errors.
     """
     names = [key for key, value in totals.items() if isinstance(value, Mapping)]
-    cells = [["motion", *names, "mm", "deg"]]
+    cells = [["motion", *names, "mm", "deg", *RATIOS]]
     for row in rows:
-        errors = [_error(row["errors"], q) for q in ("object_pos", "object_rot")]
+        errors = plain(row["mope"]), plain(in_unit("object_rot", row["more"]))
         states = [STATES.get(row[name], str(row[name])) for name in names]
-        cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors])
+        ratios = [plain(row[f"{name}_ratio"], 2) for name in RATIOS]
+        cells.append([shorten(row["motion"], NAME_WIDTH), *states, *errors, *ratios])
     counts = [_rate(totals[name]) for name in names]
-    cells.append([f"all {len(rows)}", *counts, "", ""])
+    means = plain(totals["mope_all"]), plain(in_unit("object_rot", totals["more_all"]))
+    cells.append([f"all {len(rows)}", *counts, *means, "", ""])
     head = f"policy of {totals.get('env_steps', 0):,} env steps"
     notes = [*_means(totals), "n.m.: not measured on this motion"]
     return "\n".join([head, "", *align(cells), "", *notes])
@@ -153,6 +161,8 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
     """Every criterion of a stored rollout, with the numbers that were compared."""
     cells = [["criterion", "state", "values against limits"]]
     for verdict in verdicts.values():
+        if verdict.name.startswith("completed") and not verdict.is_passed:
+            continue  # no file says how the episode ended
         parts = [
             f"{SHOWN[q][0]} {plain(in_unit(q, value))}/"
             f"{in_unit(q, verdict.limits[q]):g} {SHOWN[q][1]}"
@@ -166,8 +176,33 @@ def score_table(name: str, verdicts: Mapping[str, Verdict]) -> str:
 def replay_line(motion: str, stored: str | None, found: str, *, holds: bool) -> str:
     """One replayed rollout: its verdict in the run's files, and of the replay."""
     word = "holds" if holds else "DOES NOT HOLD"
-    name = shorten(motion, 40)
-    return f"{name:<40}  stored {stored or 'none':<12}  found {found:<12}  {word}"
+    name = shorten(printable(motion), 40)
+    stored = printable(stored or "none")
+    return f"{name:<40}  stored {stored:<12}  found {found:<12}  {word}"
+
+
+def finding_lines(findings: Sequence[Finding], why: str = "") -> list[str]:
+    """Differences first, then what was not checked; alike ones of many files once.
+
+    ``why``: why there is no library to check against, or empty.
+    """
+    lines = [f"DIFFERS  {printable(f)}" for f in findings if f.is_fault]
+    unchecked: dict[str, int] = {}
+    for finding in findings:
+        if not finding.is_fault:
+            text = f"{finding.what}: {finding.text}"
+            unchecked[text] = unchecked.get(text, 0) + 1
+    if why and unchecked:
+        lines.append(f"not checked against a library: {printable(why)}")
+    return lines + [
+        f"not checked  {printable(text)}" + (f" ({count} times)" if count > 1 else "")
+        for text, count in unchecked.items()
+    ]
+
+
+def printable(value: object) -> str:
+    """One line of text that a terminal shows as it is."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(value))
 
 
 ROWS = 12  # newest evaluations shown

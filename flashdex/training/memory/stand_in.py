@@ -17,7 +17,8 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.scene.scene import SceneLayout
-from flashdex.motions.library import FRAME_KEYS, NUM_OBJECT_SLOTS, MotionLibrary
+from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import FRAME_KEYS, NUM_OBJECT_SLOTS
 from flashdex.objects.asset import ObjectSettings
 from flashdex.recipe import Recipe
 from flashdex.training.build import library_name, select_motions

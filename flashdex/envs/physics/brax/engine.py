@@ -21,6 +21,7 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.physics.base import Physics, RawState
+from flashdex.envs.scene.scene import Scene
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.errors import FlashdexError, MissingExtraError
 from flashdex.hands.spec import HandSpec
@@ -62,9 +63,10 @@ class BraxPhysics(Physics):
         hands: dict[keys.Side, HandSpec],
         physics: PhysicsConfig,
         num_envs: int,
+        scenes: list[Scene] | None = None,
     ) -> None:
         refuse_unlike_objects(library)
-        super().__init__(library, hands, physics, num_envs, brax_device())
+        super().__init__(library, hands, physics, num_envs, brax_device(), scenes)
         import flashdex.envs.physics.brax.step as code
         from flashdex.envs.physics.brax.model import build_model
         from flashdex.envs.physics.brax.wrench import wrench_inputs

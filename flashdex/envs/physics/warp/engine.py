@@ -20,6 +20,7 @@ from flashdex.envs.physics.warp.model import (
     warp_device,
 )
 from flashdex.envs.physics.warp.wrench import WrenchInput
+from flashdex.envs.scene.scene import Scene
 from flashdex.envs.scene.union import build_union
 from flashdex.envs.scene.wrench import ObjectWrench
 from flashdex.hands.spec import HandSpec
@@ -107,9 +108,10 @@ class WarpPhysics(Physics):
         hands: dict[keys.Side, HandSpec],
         physics: PhysicsConfig,
         num_envs: int,
+        scenes: list[Scene] | None = None,
     ) -> None:
         wp = require_warp()[0]
-        super().__init__(library, hands, physics, num_envs, warp_device())
+        super().__init__(library, hands, physics, num_envs, warp_device(), scenes)
         union = build_union(library, hands, physics, self.scenes, model_fields())
         room = room_of(union.model, physics)
         name = str(wp.device_from_torch(self.device))

@@ -1,0 +1,398 @@
+"""What a stored rollout says, against what can be recomputed: each difference by name.
+
+Nothing of the file is trusted but its first state, its actions and its controls, and
+these only where no library is at hand.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.errors import FlashdexError
+from flashdex.hands.spec import load_hand
+from flashdex.metrics.criteria_table import resolve_criterion
+from flashdex.rollouts.bindings import bindings_of
+from flashdex.rollouts.build import grace_steps, link_names
+from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
+from flashdex.rollouts.findings import Finding, differences, short
+from flashdex.rollouts.models import compare_models, implausible, rebuild_around
+from flashdex.rollouts.resimulation import (
+    Simulation,
+    load_simulation,
+    object_poses,
+    tracked_points,
+)
+from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.safety import state_deviation
+from flashdex.rollouts.truth import Truth, settings_of
+from flashdex.system.machine import versions
+from flashdex.system.mjcf import compile_mjcf
+
+NO_LIBRARY = "its library is not at hand"
+OLD = "written by an older version, which did not bind it"
+SAME = 1e-6  # m, rad, m/s, rad/s; of numbers that one machine computes twice
+ALIKE = 1e-4  # of float32 numbers that another engine computed
+POINTS = 1e-5  # m; stored points come from float32 kinematics
+UNIT = 1e-4  # of the length of a quaternion
+IMPACTS = 0.05  # share of steps that another engine may resolve differently
+# of numbers that stand where a scene has others
+_UNFIT = (ValueError, KeyError, TypeError, IndexError, OverflowError)
+MAX_SUBSTEPS = 1_000_000  # of a file that says itself how many; an hour at 60 Hz
+# of the file alone: no library says them, hashes bind them
+_UNBOUND = {"provenance", "versions", "errors", "env_steps", "model_xml"}
+_OF_RECIPE = {"ctrl", "criterion", "seed"}  # what an override may change in a run
+_STATES = {"qpos", "qvel"}  # simulated anew, see ``_states``
+
+
+class RolloutCheck:
+    """All that is found in one rollout; ``run`` it once.
+
+    Args:
+        rollout: as loaded.
+        file: its name, for the findings.
+        truth: recipe and library of its run, None when they are not at hand.
+        is_current: the recipe is that by which the rollout was made, not a later one
+            of the same run.
+    """
+
+    def __init__(
+        self,
+        rollout: Rollout,
+        file: str,
+        truth: Truth | None,
+        *,
+        is_current: bool = True,
+    ) -> None:
+        self.rollout, self.file, self.truth = rollout, file, truth
+        self.is_current = is_current
+        self.findings: list[Finding] = []
+        self.is_sound = False  # its numbers mean something
+        self.model: mujoco.MjModel | None = None  # to be simulated; None: it may not
+        self._provenance = json.loads(rollout.provenance)
+        self._versions = json.loads(rollout.versions)
+
+    def fault(self, what: str, text: str) -> None:
+        """Note a difference."""
+        self.findings.append(Finding(self.file, what, text))
+
+    def skip(self, what: str, text: str) -> None:
+        """Note what could not be checked."""
+        self.findings.append(Finding(self.file, what, text, is_fault=False))
+
+    def run(self) -> list[Finding]:
+        """Check everything that the findings before leave a meaning."""
+        self._plain()
+        self.is_sound = not self.findings
+        if not self.is_sound:
+            return self.findings
+        self._bound()
+        simulation = self._simulation()
+        if simulation is not None and self.model is not None:
+            # of the run's own solver effort, which a certificate raises
+            self._states(self.model)
+            self._derived(simulation)
+        self._scores()
+        self._truth()
+        return self.findings
+
+    def _simulation(self) -> Simulation | None:
+        """What may be simulated, or None: it must not be, or cannot."""
+        try:
+            self._model()
+            if self.model is not None:
+                return load_simulation(self.rollout, self.model)
+        except FlashdexError as error:
+            self.fault("model", str(error))
+            self.model = None
+        return None
+
+    def _plain(self) -> None:
+        """Numbers that are none, rotations that are none, sizes without meaning."""
+        r = self.rollout
+        for name in _array_names(r):
+            value = np.asarray(getattr(r, name))
+            if not np.isfinite(value).all():
+                at = np.argwhere(~np.isfinite(value))[0].tolist()
+                self.fault(name, f"is not finite at {at}")
+        if r.num_frames == 0:
+            self.fault("frames", "there are none")
+        elif r.num_frames * r.decimation > MAX_SUBSTEPS:
+            self.fault("frames", f"{r.num_frames} of them are no motion")
+        elif r.grace != grace_steps(r.fps):
+            self.fault("grace", f"is {r.grace}, expected {grace_steps(r.fps)}")
+        if r.num_frames < r.reference_length and self.truth is None:
+            self.fault("frames", f"{r.num_frames} of {r.reference_length} are left")
+        try:
+            resolve_criterion(r.criterion)
+        except FlashdexError as error:
+            self.fault("criterion", str(error))
+        if not self.findings:
+            self._quaternions()
+
+    def _quaternions(self) -> None:
+        r = self.rollout
+        present = np.flatnonzero(np.asarray(r.object_qpos_adr) >= 0)
+        found = [
+            ("object_quat", r.object_quat[:, present]),
+            ("ref_object_quat", r.ref_object_quat[:, present]),
+        ]
+        for adr in np.asarray(r.object_qpos_adr)[present].tolist():
+            found.append(("qpos0", r.qpos0[adr + 3 : adr + 7]))
+            found.append(("qpos", r.qpos[:, adr + 3 : adr + 7]))
+        for name, quat in found:
+            length = np.linalg.norm(quat, axis=-1)
+            if quat.shape[-1] != 4 or (np.abs(length - 1) > UNIT).any():
+                self.fault(name, "holds a quaternion that is no rotation")
+
+    def _bound(self) -> None:
+        """Hashes and limits that the file itself carries."""
+        r = self.rollout
+        for name, value in bindings_of(r).items():
+            stored = self._provenance.get(name)
+            if stored is None:
+                self.skip(name, OLD)
+            elif stored != value:
+                self.fault(name, f"is {short(stored)}, expected {short(value)}")
+        wrench = r.wrench
+        if wrench is not None and np.abs(wrench).max(initial=0.0) > 0:
+            self.fault("wrench", f"is up to {np.abs(wrench).max():.3g}, expected none")
+
+    def _model(self) -> None:
+        """The stored model against one built anew; sets what may be simulated."""
+        r = self.rollout
+        where = f"{self.file}: model_xml"
+        truth = self.truth if self.is_current else None
+        if truth is None or r.motion not in truth.bank.names:
+            self.model = compile_mjcf(r.model_xml, where=where)
+            self._model_alone(self.model)
+            return
+        scene = truth.scene(r.motion, nodes=0)
+        if r.model_xml == scene.xml:
+            self.model = scene.model
+            return
+        # of a collection of several scenes, padded to the largest
+        self.model = compile_mjcf(r.model_xml, where=where)
+        scene = truth.scene(r.motion, nodes=self.model.nbvh)
+        if r.model_xml != scene.xml:
+            exact = self._versions.get("mujoco") == mujoco.__version__
+            self._compare(self.model, scene.model, exact=exact)
+        bodies = load_simulation(r, scene.model).object_body
+        for name, text in implausible(scene.model, bodies).items():
+            self.skip(f"model {name}", f"{text}, by recipe and library themselves")
+
+    def _model_alone(self, model: mujoco.MjModel) -> None:
+        """Without library: everything but shapes, masses and supports."""
+        r = self.rollout
+        settings, hands = self._settings(), None
+        try:
+            hands = load_hand(r.hand)
+        except FlashdexError:
+            note = self.skip if settings is None else self.fault
+            note("hand", f"'{r.hand}' is not known here; install the package of it")
+        bodies = load_simulation(r, model).object_body
+        for name, text in implausible(model, bodies).items():
+            self.fault(f"model {name}", text)
+        if settings is None or hands is None:
+            return
+        try:
+            slots = np.asarray(r.hand_object).tolist()
+            around = rebuild_around(r.model_xml, model, hands, settings, slots)
+        except (*_UNFIT, mujoco.FatalError) as error:
+            self.fault("model", f"is no scene of this hand ({error})")
+            return
+        if r.joint_bodies != link_names(hands):
+            self.fault("joint_bodies", "are not the links of this hand")
+        self._compare(model, around, exact=False)
+        self.skip("model", f"shapes, masses and supports of objects: {NO_LIBRARY}")
+
+    def _settings(self) -> PhysicsConfig | None:
+        """Physics settings of the run, else those that the file names."""
+        if self.truth is not None and self.is_current:
+            return self.truth.recipe.physics
+        stored = self._provenance.get("physics")
+        if stored is None:
+            self.skip("model", OLD)
+            return None
+        try:
+            settings = PhysicsConfig(**stored)
+            step = settings.timestep * settings.decimation * self.rollout.fps
+        except TypeError as error:
+            self.fault("physics", f"are no settings ({error})")
+            return None
+        if settings.decimation != self.rollout.decimation or not abs(step - 1) < 1e-3:
+            self.fault("physics", f"{step:.3g} control steps in one")
+        return settings
+
+    def _compare(
+        self, stored: mujoco.MjModel, expected: mujoco.MjModel, *, exact: bool
+    ) -> None:
+        for name, text in compare_models(stored, expected, exact=exact).items():
+            self.fault(f"model {name}", text)
+
+    def _states(self, model: mujoco.MjModel) -> None:
+        """The states that follow from the first one and the controls."""
+        r = self.rollout
+        run = simulate(model, r)
+        worst = {n: np.abs(v - getattr(r, n)).max(axis=1) for n, v in run.items()}
+        if all((error <= SAME).all() for error in worst.values()):
+            return
+        here = versions()
+        same = all(
+            self._versions.get(k, here[k]) == here[k] for k in ("mujoco", "engine")
+        ) and _machine(self._versions) == _machine(here)
+        if same:
+            for name, error in worst.items():
+                beyond = np.flatnonzero(~(error <= SAME))
+                if len(beyond):
+                    self.fault(
+                        name,
+                        f"leaves what the controls lead to at frame {beyond[0]}, by up "
+                        f"to {error.max():.3g}",
+                    )
+            return
+        self._single_steps(model)
+
+    def _single_steps(self, model: mujoco.MjModel) -> None:
+        """Of another engine or machine: does each state follow from the one before?"""
+        r = self.rollout
+        run = simulate(model, r, single=True)
+        shift, turn = state_deviation(model, run["qpos"], r.qpos)
+        beyond = ~((shift <= DEVIATION_M) & (turn <= DEVIATION_RAD))
+        if beyond.mean() > IMPACTS:
+            self.fault(
+                "qpos",
+                f"{beyond.mean():.0%} of the states do not follow from the one before, "
+                f"first at frame {int(np.flatnonzero(beyond)[0])}",
+            )
+        made = f"{self._versions.get('engine')} on {_machine(self._versions)}"
+        self.skip(
+            "qpos, qvel", f"to the last digit: made by {made}, checked step by step"
+        )
+
+    def _derived(self, simulation: Simulation) -> None:
+        """Points and poses that follow from the stored positions."""
+        r = self.rollout
+        active = np.flatnonzero(r.hand_active)
+        slots = np.flatnonzero(np.asarray(r.object_qpos_adr) >= 0)
+        points = tracked_points(simulation, r.qpos)
+        for name, value in (points | object_poses(simulation, r.qpos)).items():
+            stored = getattr(r, name)
+            rows = slots if name.startswith("object") else active
+            if stored is None:
+                continue
+            if value is None:
+                self.skip(name, "the model lacks some of its points")
+                continue
+            error = np.abs(value[:, rows] - stored[:, rows]).max(initial=0.0)
+            if not error <= POINTS:
+                self.fault(name, f"is up to {error:.3g} off the stored positions")
+
+    def _scores(self) -> None:
+        r = self.rollout
+        verdict = r.score()[resolve_criterion(r.criterion)]
+        if not verdict.is_passed:
+            self.fault("criterion", f"{verdict.name} is not passed: {verdict.reason}")
+        stored = json.loads(r.errors)
+        if not stored:
+            self.skip("errors", "none are stored")
+            return
+        expected = {k: round(v, 6) for k, v in verdict.values.items()}
+        for text in differences(stored, expected, tolerance=2e-6):
+            self.fault("errors", text)
+
+    def _truth(self) -> None:
+        """Field by field against the rollout that recipe and library give."""
+        r, truth = self.rollout, self.truth
+        if truth is None:
+            self.skip("roles, reference, first state, actions, criterion", NO_LIBRARY)
+            return
+        if r.motion not in truth.bank.names:
+            self.fault("motion", f"'{r.motion}' is none of the run's")
+            return
+        if r.num_frames != truth.num_steps(r.motion):
+            steps = truth.num_steps(r.motion)
+            self.fault("frames", f"{r.num_frames}, expected {steps}")
+            return
+        if r.actions.shape != (r.num_frames, 2, truth.bank.num_joints):
+            self.fault("actions", f"have shape {r.actions.shape}")
+            return
+        nodes = 0 if self.model is None else self.model.nbvh
+        model = truth.scene(r.motion, nodes=nodes).model
+        if (r.qpos.shape[1], r.qvel.shape[1]) != (model.nq, model.nv):
+            self.fault("qpos", f"{r.qpos.shape[1]} columns, expected {model.nq}")
+            return
+        self._fields(truth.remake(r, nodes=nodes))
+        if not self.is_current:
+            return
+        stored = self._provenance.get("physics")
+        if stored not in (None, settings_of(truth.recipe)):
+            self.fault("physics", "other settings than the recipe of the run")
+        engine = self._versions.get("engine", truth.recipe.physics.engine)
+        if engine != truth.recipe.physics.engine:
+            self.fault("versions", f"engine {engine}, another than the recipe's")
+
+    def _fields(self, expected: Rollout) -> None:
+        is_own = self._versions.get("engine") == "cpu"
+        skipped = _UNBOUND | _STATES | {"model_sha256"}
+        skipped |= set() if self.is_current else _OF_RECIPE
+        for name in (f.name for f in fields(Rollout)):
+            a, b = getattr(self.rollout, name), getattr(expected, name)
+            if name in skipped:
+                continue
+            if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+                error = _distance(a, b)
+                if not error <= (SAME if is_own else ALIKE):
+                    self.fault(name, f"is up to {error:.3g} off what the library gives")
+            elif (a is None) != (b is None) or a != b:
+                self.fault(name, f"is {short(a)}, expected {short(b)}")
+
+
+def _array_names(rollout: Rollout) -> list[str]:
+    names = (f.name for f in fields(Rollout))
+    return [n for n in names if isinstance(getattr(rollout, n), np.ndarray)]
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    if a.shape != b.shape:
+        return math.inf
+    return float(np.abs(a.astype(float) - b.astype(float)).max(initial=0.0))
+
+
+def _machine(made_by: dict[str, Any]) -> str:
+    """Kind of processor: ``x86_64`` of ``NVIDIA H200, x86_64, 16 CPU cores``."""
+    words = str(made_by.get("hardware", "")).split(", ")
+    return words[-2] if len(words) > 1 else ""
+
+
+def simulate(
+    model: mujoco.MjModel, rollout: Rollout, *, single: bool = False
+) -> dict[str, np.ndarray]:
+    """States of the controls in MuJoCo C with the settings of the model, nothing more.
+
+    Args:
+        model: as stored, or built anew.
+        rollout: first state and controls.
+        single: begin every control step from the stored state before it.
+
+    Returns:
+        ``qpos`` (T, nq) and ``qvel`` (T, nv).
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = rollout.qpos0, rollout.qvel0
+    if rollout.act0 is not None and model.na:
+        data.act[:] = rollout.act0
+    out = {"qpos": np.empty_like(rollout.qpos), "qvel": np.empty_like(rollout.qvel)}
+    for t, row in enumerate(rollout.ctrl):
+        if single and t:
+            data.qpos[:], data.qvel[:] = rollout.qpos[t - 1], rollout.qvel[t - 1]
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, nstep=rollout.decimation)
+        out["qpos"][t], out["qvel"][t] = data.qpos, data.qvel
+    return out

@@ -1,0 +1,404 @@
+"""``flashdex replay`` and ``verify``: a run's claims against what can be recomputed.
+
+Files are bound to one another by hashes: a rollout names recipe, library and reference,
+a certificate its rollout, a line of the ledger both files, each line the one before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flashdex.errors import FlashdexError, RunError
+from flashdex.metrics.criteria import criterion_names, moves_too_little
+from flashdex.rollouts.certificate import CERTIFICATE_SCHEMA, PROVEN, certify
+from flashdex.rollouts.checks import OLD, RolloutCheck
+from flashdex.rollouts.findings import Finding, differences, short
+from flashdex.rollouts.ledger import (
+    CONVERSIONS,
+    ROLLOUTS,
+    UNMOVED,
+    read_ledger,
+    rollout_name,
+)
+from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.truth import Truth
+from flashdex.system.arrays import hash_content
+from flashdex.system.files import own_file, own_files
+from flashdex.system.names import file_stem
+from flashdex.system.run_files import RECIPE, read_metrics, read_recipe, read_sessions
+
+CERTIFICATE = ".certificate.json"
+MAX_JSON = 16 << 20  # bytes of a certificate
+# of a certificate: where it was made, and what follows from a clock
+_ELSEWHERE = ("identity.certified_by", "provenance.certified_on")
+# of a line: what is counted from the rollout it names
+COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
+RATIOS = ("lift_ratio", "path_ratio")
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """One stored rollout: what the run says of it, and what was found."""
+
+    motion: str
+    stored: str | None  # verdict in the run's files, None when there is none
+    found: str  # verdict of the certificate made now
+    findings: tuple[Finding, ...]  # of rollout, certificate and its line
+
+    @property
+    def faults(self) -> list[Finding]:
+        """What is not as it should be."""
+        return [finding for finding in self.findings if finding.is_fault]
+
+    @property
+    def holds(self) -> bool:
+        """The conversion is proven, and the files say so truthfully."""
+        return not self.faults and self.found in PROVEN
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What was found in a run."""
+
+    rollouts: list[Replayed]
+    ledger: list[Finding]  # of the lines, and of files that no line names
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All, those of the ledger first."""
+        return [*self.ledger, *(f for one in self.rollouts for f in one.findings)]
+
+    @property
+    def holds(self) -> bool:
+        """Every stored rollout is proven, and the lines are those of the run."""
+        no_fault = not any(finding.is_fault for finding in self.ledger)
+        return no_fault and all(one.holds for one in self.rollouts)
+
+
+def verify_run(run_dir: str | Path, truth: Truth | None = None) -> Verified:
+    """Recompute everything that the stored rollouts of a run claim.
+
+    Args:
+        run_dir: folder of the run.
+        truth: its recipe with its library; without, what they would tell is listed as
+            not checked.
+
+    Raises:
+        RunError: there is nothing to verify.
+    """
+    return _RunCheck(Path(run_dir), truth).run()
+
+
+def verify_file(path: str | Path, truth: Truth | None = None) -> list[Finding]:
+    """What is found in one rollout file, without the run around it.
+
+    Raises:
+        RunError: it is no rollout.
+    """
+    path = Path(path)
+    check = RolloutCheck(Rollout.load(path), str(path), truth)
+    return check.run()
+
+
+class _RunCheck:
+    def __init__(self, run_dir: Path, truth: Truth | None) -> None:
+        self.run_dir, self.truth = run_dir, truth
+        self.findings: list[Finding] = []
+        self._baselines: dict[tuple[str, str], list[str]] | None = None
+
+    def fault(self, what: str, text: str, *, file: str = CONVERSIONS) -> None:
+        self.findings.append(Finding(file, what, text))
+
+    def run(self) -> Verified:
+        files = own_files(self.run_dir, ROLLOUTS, "*.npz")
+        self._baselines = self._passing_baselines()
+        lines = self._lines()
+        told = {x["motion"]: x for x in lines if x.get("rollout")}  # the newest
+        if not files and not told:
+            raise RunError(
+                f"{self.run_dir}: no stored rollout in '{ROLLOUTS}/'. Either nothing "
+                "has been converted yet, or this is not a run directory."
+            )
+        names = {file.name for file in files}
+        for motion in told:
+            if Path(rollout_name(motion)).name not in names:
+                self.fault(motion, f"its {rollout_name(motion)} is missing")
+        found = [self._one(file, told) for file in files]
+        for path in own_files(self.run_dir, ROLLOUTS, f"*{CERTIFICATE}"):
+            if path.name.removesuffix(CERTIFICATE) + ".npz" not in names:
+                self.fault("certificate", "of no rollout", file=self._name(path))
+        return Verified(found, self.findings)
+
+    def _name(self, path: Path) -> str:
+        return f"{ROLLOUTS}/{path.name}"
+
+    def _lines(self) -> list[dict[str, Any]]:
+        """Lines of the ledger; one that is not as it was written ends the list."""
+        try:
+            lines = read_ledger(own_file(self.run_dir, CONVERSIONS))
+        except FlashdexError as error:
+            self.fault("lines", str(error))
+            return []
+        attempts, wall_s = self._attempts(), 0.0
+        if len(lines) < attempts:
+            self.fault("lines", f"{len(lines)} are left of {attempts} attempts")
+        if len(lines) > attempts and self._is_over():
+            self.fault("lines", f"{len(lines)} of {attempts} attempts")
+        for number, line in enumerate(lines, start=1):
+            where = f"line {number}"
+            if line["wall_s"] < wall_s:
+                self.fault(where, "is out of order: its wall_s is below the one before")
+            wall_s = line["wall_s"]
+            self._line(where, line)
+        self._proofs(lines)
+        return lines
+
+    def _proofs(self, lines: list[dict[str, Any]]) -> None:
+        """A motion is converted by the line that stores its first pass."""
+        kept: set[tuple[str, str]] = set()
+        for number, line in enumerate(lines, start=1):
+            key = (line["motion"], line["criterion"])
+            if line.get("rollout"):
+                kept.add(key)
+            elif line.get("certified") or line.get("verdict"):
+                self.fault(f"line {number}", "is certified, but names no rollout")
+            elif line["converted"] and key not in kept:
+                text = "is the motion's first conversion, but names no rollout"
+                self.fault(f"line {number}", text)
+
+    def _attempts(self) -> int:
+        """Attempts that the last record of the metrics counts."""
+        try:
+            records = read_metrics(self.run_dir)
+            return int(records[-1].get("convert/attempts", 0)) if records else 0
+        except (RunError, TypeError, ValueError) as error:
+            self.fault("metrics", str(error), file="metrics.jsonl")
+            return 0
+
+    def _passing_baselines(self) -> dict[tuple[str, str], list[str]] | None:
+        """Baselines by motion and criterion that they pass; None: not comparable."""
+        path = own_file(self.run_dir, "baselines.json")
+        # an override scores them anew, for the lines from then on
+        if not path.is_file() or self._was_overridden():
+            return None
+        rows, fault = _read_json(path)
+        if fault:
+            self.fault("file", fault, file=path.name)
+            return None
+        found: dict[tuple[str, str], list[str]] = {}
+        for name, motions in rows.items():
+            for motion in motions if isinstance(motions, dict) else ():
+                for criterion in _at(motions, motion, "passed") or ():
+                    found.setdefault((motion, criterion), []).append(name)
+        return found
+
+    def _line(self, where: str, line: dict[str, Any]) -> None:
+        """What one line says of itself."""
+        named = line.get("rollout")
+        if named and named != rollout_name(line["motion"]):
+            self.fault(where, f"names {named!a}, not the rollout of its motion")
+        if line["converted"] != (line["criterion"] in line.get("passed", [])):
+            self.fault(where, "converted is not what the passed criteria say")
+        if self._baselines is not None and "trivial" in line:
+            expected = self._baselines.get((line["motion"], line["criterion"]), [])
+            if [b for b in line["trivial"] if b != UNMOVED] != expected:
+                text = f"trivial is {line['trivial']}, by the baselines {expected}"
+                self.fault(where, text)
+        if named and not line["converted"]:
+            self.fault(where, "names a rollout of an attempt that did not pass")
+
+    def _one(self, path: Path, told: dict[str, dict[str, Any]]) -> Replayed:
+        file = self._name(path)
+        try:
+            rollout = Rollout.load(path)
+        except FlashdexError as error:
+            stem = path.stem
+            line = next((x for m, x in told.items() if file_stem(m) == stem), {})
+            fault = Finding(file, "file", str(error))
+            return Replayed(stem, line.get("verdict"), "not_measured", (fault,))
+        found = self._bound(rollout, file)
+        check = RolloutCheck(
+            rollout,
+            file,
+            self.truth,
+            is_current=all(f.is_fault or f.what != "recipe" for f in found),
+        )
+        found += check.run()
+        if file != rollout_name(rollout.motion):
+            found.append(Finding(file, "motion", f"is that of '{rollout.motion}'"))
+        verdict, stored, compared = self._certificate(path, rollout, check)
+        line = told.get(rollout.motion)
+        found += compared
+        if check.is_sound:
+            found += self._told(line, path, rollout, stored)
+        return Replayed(rollout.motion, stored.get("verdict"), verdict, tuple(found))
+
+    def _bound(self, rollout: Rollout, file: str) -> list[Finding]:
+        """Recipe, library and motion that the rollout was made by."""
+        said, found = json.loads(rollout.provenance), []
+        if "reference_sha256" not in said:
+            found.append(Finding(file, "hashes", OLD, is_fault=False))
+        if "recipe_sha256" in said and (self.run_dir / RECIPE).exists():
+            recipe = read_recipe(self.run_dir)
+            sha = hashlib.sha256(recipe.encode()).hexdigest()
+            if said["recipe_sha256"] != sha:
+                changed = self._was_overridden()
+                text = "recipe.yaml is another than it was made by"
+                text += ", as --resume changed it" if changed else ""
+                found.append(Finding(file, "recipe", text, is_fault=not changed))
+        if self.truth is None:
+            return found
+        library = self.truth.library
+        # older versions named a file's hash, of libraries that are not read any more
+        is_bound = "reference_sha256" in said
+        if is_bound and said.get("library_sha256") != library.content_hash:
+            text = f"{library.path} is another than it was made from"
+            found.append(Finding(file, "library", text))
+        names = self.truth.bank.names
+        if "motion_sha256" in said and rollout.motion in names:
+            sha = library.motion_hash(names.index(rollout.motion))
+            if said["motion_sha256"] != sha:
+                text = "the library has another motion of that name"
+                found.append(Finding(file, "motion", text))
+        return found
+
+    def _was_overridden(self) -> bool:
+        return any(session.get("overrides") for session in self._sessions())
+
+    def _is_over(self) -> bool:
+        """The last session ended in order, and so counted all its attempts."""
+        last = self._sessions()[-1:]
+        ended = any(x.get("event") == "end" and x.get("why") != "error" for x in last)
+        return ended and not self._was_overridden()
+
+    def _sessions(self) -> list[dict[str, Any]]:
+        try:
+            return read_sessions(self.run_dir)
+        except RunError:
+            return []
+
+    def _certificate(
+        self, path: Path, rollout: Rollout, check: RolloutCheck
+    ) -> tuple[str, dict[str, Any], list[Finding]]:
+        """Verdict of a new certificate, the stored one, and where they differ."""
+        file = own_file(self.run_dir, ROLLOUTS, path.stem + CERTIFICATE)
+        name, stored = self._name(file), {}
+        found: list[Finding] = []
+        if file.is_file():
+            stored, fault = _read_json(file)
+            found += [Finding(name, "file", fault)] if fault else []
+        if check.model is None or faults(check.findings):
+            # it is not what it says; what a replay of it would prove is nothing
+            return "not_measured", stored, found
+        try:
+            new = json.loads(certify(rollout, model=check.model).to_json())
+        except (FlashdexError, ValueError) as error:
+            return "not_measured", stored, [*found, Finding(name, "model", str(error))]
+        if stored:
+            found += _compare_certificates(stored, new, name)
+        return new["verdict"], stored, found
+
+    def _told(
+        self,
+        line: dict[str, Any] | None,
+        path: Path,
+        rollout: Rollout,
+        stored: dict[str, Any],
+    ) -> list[Finding]:
+        """The line that names a rollout, against the files."""
+        file = self._name(path)
+        if line is None:
+            text = "no line names it; if a crash left it so, 'train --resume' adds one"
+            return [Finding(file, "line", text)]
+        if line["criterion"] not in criterion_names():
+            text = f"criterion {line['criterion']!a} is none"
+            return [Finding(CONVERSIONS, file, text)]
+        expected = rollout.summary(line["criterion"])
+        pairs = [(key, line.get(key), expected[key]) for key in COUNTED]
+        new = "rollout_sha256" in line
+        pairs += [(key, line.get(key), expected[key]) for key in RATIOS if new]
+        if new:
+            has = UNMOVED in (line.get("trivial") or [])
+            unmoved = moves_too_little({k[:4]: expected[k] for k in RATIOS})
+            pairs.append((f"trivial.{UNMOVED}", has, unmoved))
+        pairs.append(("seed", line.get("seed"), rollout.seed))
+        pairs.append(("verdict", line.get("verdict"), stored.get("verdict")))
+        is_proven = stored.get("verdict") in PROVEN if stored else None
+        if "verdict" in line or stored:
+            pairs.append(("certified", line.get("certified"), is_proven))
+        certificate = path.with_name(path.stem + CERTIFICATE)
+        hashes = {"rollout_sha256": path, "certificate_sha256": certificate}
+        found = []
+        for key, other in hashes.items():
+            if not new:
+                found.append(Finding(CONVERSIONS, f"{key} of {file}", OLD, False))
+            elif other.is_file() or key in line:
+                sha = hash_content(other) if other.is_file() else None
+                pairs.append((key, line.get(key), sha))
+        return found + [
+            Finding(CONVERSIONS, f"{file}: {text.split(' ')[0]}", text)
+            for key, said, right in pairs
+            for text in differences(said, right, at=key, tolerance=2e-6)
+        ]
+
+
+def _compare_certificates(
+    stored: dict[str, Any], new: dict[str, Any], file: str
+) -> list[Finding]:
+    """Every number of a stored certificate that is not that of a new one."""
+    schema = _at(stored, "identity", "schema")
+    found: list[Finding] = []
+    if schema != CERTIFICATE_SCHEMA:
+        found.append(Finding(file, "hashes", OLD, is_fault=False))
+        stored, new = _old_part(stored), _old_part(new)
+        new["nominal"] = {k: new["nominal"].get(k) for k in stored["nominal"]}
+    here = [_at(new, *name.split(".")) for name in _ELSEWHERE]
+    there = [_at(stored, *name.split(".")) for name in _ELSEWHERE]
+    if schema == CERTIFICATE_SCHEMA and here != there:
+        text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
+        found.append(Finding(file, "numbers", text, is_fault=False))
+        stored, new = _old_part(stored), _old_part(new)
+        del stored["nominal"], new["nominal"]
+    return found + [
+        Finding(file, text.split(" ")[0], text) for text in differences(stored, new)
+    ]
+
+
+def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:
+    """Verdict, and state and values of each criterion."""
+    nominal = certificate.get("nominal")
+    nominal = nominal if isinstance(nominal, dict) else {}
+    return {
+        "verdict": certificate.get("verdict"),
+        "nominal": {
+            name: {key: _at(verdict, key) for key in ("state", "values")}
+            for name, verdict in nominal.items()
+        },
+    }
+
+
+def _at(value: Any, *names: str) -> Any:
+    for name in names:
+        value = value.get(name) if isinstance(value, dict) else None
+    return value
+
+
+def _read_json(file: Path) -> tuple[dict[str, Any], str]:
+    """A JSON object, or why it is none."""
+    try:
+        if file.stat().st_size > MAX_JSON:
+            return {}, f"{file.stat().st_size} bytes are no certificate"
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        return {}, f"is no JSON ({error})"
+    return (found, "") if isinstance(found, dict) else ({}, "is no JSON object")
+
+
+def faults(findings: Iterable[Finding]) -> list[Finding]:
+    """Those that are not only unchecked."""
+    return [finding for finding in findings if finding.is_fault]

@@ -1,0 +1,261 @@
+"""Small files that become large ones, or are none: refused before anything grows."""
+
+import io
+import json
+import os
+import pickle
+import re
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from flashdex.datasets.fields import numbers
+from flashdex.datasets.files import (
+    load_npy,
+    load_npz,
+    load_pickle,
+    load_torch,
+    read_bytes,
+    read_json,
+    read_text,
+)
+from flashdex.errors import DemoError
+
+LOADERS = {
+    "pickle": load_pickle,
+    "npy": load_npy,
+    "npz": load_npz,
+    "torch": load_torch,
+    "json": lambda path: read_json(path, "not JSON"),
+    "text": read_text,
+    "bytes": read_bytes,
+}
+loaders = pytest.mark.parametrize("load", LOADERS.values(), ids=LOADERS)
+# an entry of the list at the end of an archive, up to its flags
+ENTRY = re.compile(rb"(PK\x01\x02.{4})\0\0", re.DOTALL)
+
+
+@pytest.fixture(autouse=True)
+def no_growth():
+    """No test here may take more than a tenth of what its file pretends to be."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 400e6
+
+
+def npy_head(shape, dtype="<f8"):
+    head = io.BytesIO()
+    facts = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_2_0(head, facts)
+    return head.getvalue()
+
+
+def zipped(path, entries, *, kind=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+    return path
+
+
+def inflated(path, size, *, kind=zipfile.ZIP_DEFLATED, parts=1):
+    """An archive of zeros, written a piece at a time; its sizes are true."""
+    head = npy_head((size // 8,))
+    with zipfile.ZipFile(path, "w", kind, allowZip64=True) as archive:
+        for part in range(parts):
+            with archive.open(f"a{part}.npy", "w", force_zip64=True) as file:
+                file.write(head)
+                for _ in range(size >> 20):
+                    file.write(bytes(1 << 20))
+    return path
+
+
+@loaders
+def test_terabyte_that_is_a_hole_is_not_read(tmp_path, load):
+    with (tmp_path / "file").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(DemoError, match=r"1048576 MiB; at most \d+ MiB are read"):
+        load(tmp_path / "file")
+
+
+@loaders
+@pytest.mark.parametrize("kind", ["pipe", "device", "link_to_device", "folder"])
+def test_what_is_no_file_is_not_waited_for(tmp_path, load, kind):
+    path = tmp_path / "file"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero")
+    target = path.readlink() if kind == "device" else path
+    with pytest.raises(DemoError, match="not a file but a folder, a pipe, a device"):
+        load(target)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts"),
+    [
+        pytest.param(zipfile.ZIP_DEFLATED, 1, id="deflate"),
+        pytest.param(zipfile.ZIP_BZIP2, 1, id="bzip2"),
+        pytest.param(zipfile.ZIP_LZMA, 1, id="lzma"),
+        pytest.param(zipfile.ZIP_DEFLATED, 8, id="many_small_ones"),
+    ],
+)
+@pytest.mark.parametrize("load", [load_npz, load_torch])
+def test_archive_of_zeros_is_refused_by_its_ratio(tmp_path, load, kind, parts):
+    path = inflated(tmp_path / "a", (80 << 20) // parts, kind=kind, parts=parts)
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(DemoError, match=r"unpacks to 80 MiB, \d+ times"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"),
+    [
+        pytest.param((10**13,), "<f8", id="terabytes"),
+        pytest.param((2**31, 2**31, 2**31), "<f8", id="overflow"),
+        pytest.param((-1,), "<f8", id="negative"),
+        pytest.param((10**9,), "<U1000000", id="long_texts"),
+        pytest.param((1,) * 40, "<f8", id="too_many_axes"),
+        pytest.param((2**62,), "|V0", id="nothing_often"),
+        pytest.param((2**40,), "|S0", id="empty_texts"),
+    ],
+)
+def test_announced_shapes_are_not_allocated(tmp_path, shape, dtype):
+    data = npy_head(shape, dtype) + bytes(64)
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(DemoError, match="not a readable"):
+        load_npy(tmp_path / "a.npy")
+    for plain in (False, True):
+        with pytest.raises(DemoError, match="not a readable"):
+            load_npz(zipped(tmp_path / "a.npz", {"a.npy": data}), plain=plain)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda d: d[:-30], id="cut"),
+        pytest.param(lambda d: d.replace(b"PK\1\2", b"PK\1\3"), id="directory"),
+        pytest.param(lambda d: d[:60] + bytes([d[60] ^ 1]) + d[61:], id="flipped_bit"),
+        pytest.param(lambda d: ENTRY.sub(b"\\g<1>\1\0", d), id="encrypted"),
+        pytest.param(lambda d: d.replace(b"\x08\0", b"\x63\0"), id="unknown_method"),
+    ],
+)
+def test_unsound_archive_is_one_message(tmp_path, damage):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, a=np.arange(50), b=np.arange(3))
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(DemoError, match=r"a\.npz: not a readable"):
+        load_npz(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param("[" * 10**6, id="deep"),
+        pytest.param('{"a":' * 10**5, id="deep_objects"),
+        pytest.param("9" * 10**6, id="long_number"),
+        pytest.param('{"a": 1' + "0" * 10**5 + "}", id="long_number_inside"),
+        pytest.param("\ud800".encode("utf-8", "surrogatepass"), id="surrogates"),
+        pytest.param(b"\xff\xfe{\0}\0", id="utf16"),
+        pytest.param(b"\0" * 1000, id="nul"),
+        pytest.param("", id="empty"),
+    ],
+)
+def test_json_bombs_are_one_message(tmp_path, text):
+    data = text if isinstance(text, bytes) else text.encode()
+    (tmp_path / "a.json").write_bytes(data)
+    with pytest.raises(DemoError, match=r"a\.json: not JSON"):
+        read_json(tmp_path / "a.json", "not JSON")
+
+
+def laughs(levels, make):
+    item = make([0] * 10)
+    for _ in range(levels):
+        item = make([item] * 10)
+    return item
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [
+        pytest.param(laughs(9, list), id="lists"),
+        pytest.param(laughs(9, tuple), id="tuples"),
+        pytest.param(laughs(9, lambda x: dict(enumerate(x))), id="tables"),
+        pytest.param([bytes(10**6)] * 10**5, id="long_parts_are_shared"),
+    ],
+)
+def test_pickle_of_the_same_parts_does_not_grow(tmp_path, bomb):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(bomb))
+    if isinstance(bomb, list) and isinstance(bomb[0], bytes):
+        assert load_pickle(path)[99_999] == bytes(10**6)
+        return
+    with pytest.raises(DemoError, match="more than 50000000 parts"):
+        load_pickle(path)
+
+
+@pytest.mark.parametrize(
+    "ops",
+    [
+        pytest.param(b"(" * 10**6 + b".", id="marks"),
+        pytest.param(b"\x80\x04" + b"]\x94" * 10**4 + b"a" * 9_999 + b".", id="deep"),
+        pytest.param(b"I" + b"9" * 10**6 + b"\n.", id="long_number"),
+        pytest.param(b"L" + b"9" * 10**6 + b"L\n.", id="long_old_number"),
+        pytest.param(b"\x80\x04\x8b\xff\xff\xff\x7f1.", id="long_length"),
+        pytest.param(b"\x80\x04\x8b\xff\xff\xff\xff1.", id="negative_length"),
+        pytest.param(b"\x80\x04\x95" + b"\xff" * 8 + b".", id="frame"),
+        pytest.param(b"\x80\xff.", id="protocol"),
+        pytest.param(b"0" * 10**6, id="pops"),
+        pytest.param(b"g999\n.", id="memo_that_is_not_there"),
+        pytest.param(b"S'" + b"\\x41" * 10 + b"\n.", id="open_quote"),
+    ],
+)
+def test_pickles_of_odd_steps_are_one_message(tmp_path, ops):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(ops)
+    with pytest.raises(DemoError, match=r"a\.pkl: not a readable pickle"):
+        load_pickle(path)
+
+
+@pytest.mark.parametrize(
+    "many",
+    [
+        pytest.param(np.broadcast_to(np.float64(1), (10**6, 10**6)), id="array"),
+        pytest.param(torch.ones(1).expand(10**6, 10**6), id="tensor"),
+    ],
+)
+def test_views_that_say_they_are_many_are_not_copied(many):
+    with pytest.raises(DemoError, match="1000000000000 numbers"):
+        numbers(many, what="file: key")
+
+
+def test_torch_file_of_a_view_does_not_grow(tmp_path):
+    path = tmp_path / "a.pt"
+    torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)
+    assert path.stat().st_size < 10**4
+    with pytest.raises(DemoError, match="1000000000000 numbers"):
+        numbers(load_torch(path)["a"], what="file: a")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_shared_names_are_not_read_twice(tmp_path):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for value in (1, 2):
+            file = io.BytesIO()
+            np.save(file, np.array(value))
+            archive.writestr("a.npy", file.getvalue())
+    assert load_npz(path) == {"a": 2}
+
+
+def test_large_json_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("flashdex.datasets.files.MAX_TEXT", 1 << 20)
+    (tmp_path / "a.json").write_text(json.dumps(["x" * (1 << 20)]))
+    with pytest.raises(DemoError, match="1 MiB; at most 1 MiB are read"):
+        read_json(tmp_path / "a.json", "not JSON")

@@ -1,0 +1,48 @@
+"""Work in a child process: its value comes back, and whatever ends it is told."""
+
+import json
+import math
+import os
+import time
+
+import pytest
+
+from flashdex.system.limited import LimitError, run_limited
+
+LIMITS = {"memory": 1 << 30, "seconds": 2}
+
+
+def test_value_comes_back():
+    assert run_limited(math.gcd, 12, 18, **LIMITS) == 6
+
+
+@pytest.mark.parametrize(
+    ("function", "args", "told"),
+    [
+        pytest.param(math.factorial, (10**8,), "more than 2 s", id="cpu_time"),
+        pytest.param(bytes, (8 << 30,), "more than 1.0 GiB", id="memory"),
+        pytest.param(os.abort, (), "ended the process", id="crash"),
+        pytest.param(os._exit, (0,), "ended the process", id="silent_end"),
+        pytest.param(json.loads, ("{",), "JSONDecodeError", id="exception"),
+    ],
+)
+def test_what_ends_it_is_told(function, args, told):
+    with pytest.raises(LimitError, match=told):
+        run_limited(function, *args, **LIMITS)
+
+
+def test_sleeping_counts_as_time(monkeypatch):
+    monkeypatch.setattr("flashdex.system.limited.GRACE", 0.0)
+    start = time.monotonic()
+    with pytest.raises(LimitError, match="more than 1 s"):
+        run_limited(time.sleep, 60, memory=1 << 30, seconds=1)
+    assert time.monotonic() - start < 10
+
+
+def test_it_writes_no_file(tmp_path):
+    with pytest.raises(LimitError):
+        run_limited(os.truncate, str(tmp_path / "new"), 10, **LIMITS)
+    (tmp_path / "file").touch()
+    with pytest.raises(LimitError):
+        run_limited(os.truncate, str(tmp_path / "file"), 10, **LIMITS)
+    assert (tmp_path / "file").stat().st_size == 0

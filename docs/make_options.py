@@ -62,6 +62,8 @@ def field_docs(cls: type) -> dict[str, str]:
 def allowed(field: dataclasses.Field[Any], hint: Any) -> str:
     """Say what a field accepts: its type or choices, and its range."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return allowed(field, args[0]) + within(args[1])
     if origin is typing.Literal:
         return ", ".join(f"`{a}`" for a in args)
     if origin is list:
@@ -76,6 +78,13 @@ def allowed(field: dataclasses.Field[Any], hint: Any) -> str:
         if field.metadata.get(key) is not None
     ]
     return " ".join([names.get(hint, str(hint)), " and ".join(bounds)]).strip()
+
+
+def within(rules: Any) -> str:
+    """Say what range a number of a list has; a list itself has a length."""
+    pairs = [(k, getattr(r, k, None)) for r in rules.metadata for k in ("ge", "le")]
+    found = {k: v for k, v in pairs if v is not None}
+    return f" &ge; {found['ge']} and &le; {found['le']}" if found else ""
 
 
 def default(field: dataclasses.Field[Any]) -> str:
@@ -98,7 +107,8 @@ def default(field: dataclasses.Field[Any]) -> str:
 
 def table(cls: type) -> list[str]:
     """Return the table of one dataclass, without what has a section of its own."""
-    docs, hints = field_docs(cls), typing.get_type_hints(cls)
+    docs = field_docs(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     lines = ["| key | default | allowed | meaning |", "| --- | --- | --- | --- |"]
     for field in dataclasses.fields(cls):
         if not has_own_section(cls, field.name, hints[field.name]):

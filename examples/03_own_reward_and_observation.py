@@ -17,7 +17,7 @@ from flashdex.envs.mdp import number, observation, reward
 
 
 @reward(weight=0.1, needs_object=True, gate="imitation")
-def steady_object(step, *, scale: float = number(1.0, above=0)):
+def steady_object(step, *, scale: float = number(1.0, above=0, high=1000)):
     """Objects that hardly turn, exp(-scale |w|).
 
     Args:

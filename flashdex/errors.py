@@ -24,6 +24,20 @@ class FlashdexError(Exception):
         return f"{self.code}: {self.text}" if self.code else str(self.text)
 
 
+def printable(text: str) -> str:
+    r"""Return a text whose control characters, but line ends, are shown as escapes.
+
+    What comes from a file must neither steer the terminal nor hide in it.
+
+    Example:
+        >>> printable("a\x1b[31mb")
+        'a\\x1b[31mb'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"`` for the closest known name, or nothing.
 
@@ -84,14 +98,26 @@ class UnknownRecipeError(UnknownNameError):
     kind = "recipe"
 
 
+class UnknownOptionError(UnknownNameError):
+    """An option of a group of recipes that does not exist."""
+
+    kind = "option"
+
+
 class RecipeError(FlashdexError):
     """All mistakes of a recipe at once, each with its YAML path."""
 
     def __init__(self, problems: list[str], *, where: str = "recipe") -> None:
         self.problems = problems
-        lines = "\n".join(f"  {i + 1}. {p}" for i, p in enumerate(problems))
+        shown = [_one_line(problem) for problem in problems]
+        lines = "\n".join(f"  {i + 1}. {p}" for i, p in enumerate(shown))
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
         super().__init__(f"{where}: {count}\n{lines}")
+
+
+def _one_line(text: str, most: int = 800) -> str:
+    text = printable(text).replace("\n", " ")
+    return text if len(text) <= most else f"{text[: most - 103]}...{text[-100:]}"
 
 
 class DemoError(FlashdexError):

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flashdex.errors import FlashdexError
+from flashdex.cli.interrupt import loading
+from flashdex.cli.terminal import number_above, path, say
+from flashdex.datasets import source_names
+from flashdex.errors import FlashdexError, UnknownHandError, UnknownSourceError
+from flashdex.hands import known_hands
 
 if TYPE_CHECKING:  # the command line starts fast: heavy parts load in their verb
     from flashdex.motions.pipeline.prepare import Order
 
+MADE_UP = "procedural"  # its --input is a word
 Handler = Callable[[argparse.Namespace], int]
 
 
@@ -25,25 +31,26 @@ def add_data_verbs(
     """
     verb = add("fetch", _fetch, "download recordings that need no registration")
     verb.add_argument("name", help="myodm: 95 clips of one hand and one object")
-    verb.add_argument("--out", type=Path, help="folder (default: in the cache)")
-    verb.add_argument("--wheel", type=Path, help="package file fetched by other means")
+    verb.add_argument("--out", type=path, help="folder (default: in the cache)")
+    verb.add_argument("--wheel", type=path, help="package file fetched by other means")
 
     verb = add("prepare", _prepare, "make a motion library from recordings")
     verb.add_argument(
         "--source", required=True, help="reader; `flashdex ls` says what each reads"
     )
-    verb.add_argument("--input", type=Path, help="folder (or file) of the recordings")
+    verb.add_argument("--input", type=path, help="folder (or file) of the recordings")
     verb.add_argument("--hand", default="xhand", help="robot hand (%(default)s)")
-    verb.add_argument("--out", type=Path, help="folder of the library")
-    verb.add_argument("--mano", type=Path, help="folder with MANO_LEFT, MANO_RIGHT")
-    verb.add_argument("--models", type=Path, help="folder of the object models")
-    verb.add_argument("--splits", type=Path, help="file that names the splits")
+    verb.add_argument("--out", type=path, help="folder of the library")
+    verb.add_argument("--mano", type=path, help="folder with MANO_LEFT, MANO_RIGHT")
+    verb.add_argument("--models", type=path, help="folder of the object models")
+    verb.add_argument("--splits", type=path, help="file that names the splits")
+    rate, count = number_above(0), number_above(0, whole=True)
     verb.add_argument(
-        "--hz", type=float, default=60.0, help="control rate, 1/s (%(default)g)"
+        "--hz", type=rate, default=60.0, help="control rate, 1/s (%(default)g)"
     )
     verb.add_argument(
         "--speed",
-        type=float,
+        type=rate,
         default=1.0,
         help="of playback; 0.5 makes motions last twice as long",
     )
@@ -54,10 +61,17 @@ def add_data_verbs(
         help="cut where contact begins and ends (auto: sessions and over 20 s)",
     )
     verb.add_argument("--strict", action="store_true", help="reject what is flagged")
-    verb.add_argument("--workers", type=int, default=1, help="processes (%(default)s)")
+    verb.add_argument(
+        "--workers", type=count, default=1, help="processes (%(default)s)"
+    )
     verb.add_argument("--ray", action="store_true", help="use a Ray cluster")
-    verb.add_argument("--limit", type=int, help="only the first N recordings")
-    verb.add_argument("--seed", type=int, default=0, help="of made-up motions")
+    verb.add_argument("--limit", type=count, help="only the first N recordings")
+    verb.add_argument(
+        "--seed",
+        type=number_above(-1, whole=True),
+        default=0,
+        help="of made-up motions",
+    )
     verb.add_argument(
         "--no-thumbnails", action="store_true", help="report.html without pictures"
     )
@@ -73,33 +87,51 @@ def add_data_verbs(
         metavar="key=value",
         help="changes, e.g. motions.library=libraries/mine",
     )
-    verb.add_argument("--out", type=Path, help="JSON file for every score")
+    verb.add_argument("--out", type=path, help="JSON file for every score")
 
 
 def _fetch(args: argparse.Namespace) -> int:
-    from flashdex.datasets.fetch import NOTE, fetch
+    with loading():
+        from flashdex.datasets.fetch import NOTE, fetch
 
     folder = fetch(args.name, args.out, wheel=args.wheel)
     where = "" if args.out is None else f" --input {folder}"
-    print(f"{NOTE}\n{folder}")
-    print(f"next: flashdex prepare --source {args.name}{where} --out libraries/myodm")
+    say(f"{NOTE}\n{folder}")
+    say(f"next: flashdex prepare --source {args.name}{where} --out libraries/myodm")
     return 0
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from flashdex.motions.pipeline.prepare import run_order
-    from flashdex.reports.library.report import summary_lines, write_library_report
+    _check_words(args)
+    with loading():
+        from flashdex.motions.pipeline.prepare import run_order
+        from flashdex.reports.library.report import (
+            summary_lines,
+            write_library_report,
+        )
 
-    order = _order(args)
+        order = _order(args)
     if args.dry_run:
         return _list_recordings(order)
-    if args.out is None:
-        raise FlashdexError("give --out: the folder of the library")
     library = run_order(order, args.out, workers=args.workers, ray=args.ray)
     report = write_library_report(library, thumbnails=not args.no_thumbnails)
-    print("\n".join(summary_lines(library)))
-    print(f"{library.path}: figures in report.csv, pictures in {report}")
+    say("\n".join(summary_lines(library)))
+    say(f"{library.path}: figures in report.csv, pictures in {report}")
     return 0
+
+
+def _check_words(args: argparse.Namespace) -> None:
+    """Refuse what can be refused before anything is loaded."""
+    if args.source not in source_names():
+        raise UnknownSourceError(args.source, source_names())
+    if args.hand not in known_hands():
+        raise UnknownHandError(args.hand, known_hands())
+    for name in ("input", "mano", "models", "splits"):
+        path = getattr(args, name)
+        if path is not None and not (os.path.lexists(path) or args.source == MADE_UP):
+            raise FlashdexError(f"--{name}: no such file or folder: {path}")
+    if args.out is None and not args.dry_run:
+        raise FlashdexError("give --out: the folder of the library")
 
 
 def _order(args: argparse.Namespace) -> Order:
@@ -129,21 +161,34 @@ def _list_recordings(order: Order) -> int:
     recordings = order.recordings()
     for recording in recordings:
         size = sum(file.stat().st_size for file in recording.files)
-        # a name must neither steer the terminal nor be half a character
-        name = "".join(c if c.isprintable() else "?" for c in recording.name)
-        print(f"{name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
-    print(f"{len(recordings)} recordings")
+        name = recording.name.replace("\n", "?")  # a name is one line
+        say(f"{name}  {len(recording.files)} files, {size / 1e6:.1f} MB")
+    say(f"{len(recordings)} recordings")
     return 0
 
 
 def _baselines(args: argparse.Namespace) -> int:
-    from flashdex.recipe import Recipe, compose, expect_kind
-    from flashdex.training.baselines import format_baselines, score_baselines
-    from flashdex.training.build import RunBuilder
-
-    recipe = compose(args.recipe, args.overrides)
-    bench = RunBuilder.from_recipe(expect_kind(recipe, Recipe, where="baselines"))
     if args.out is not None:
-        args.out.unlink(missing_ok=True)  # scores of another time are no answer
-    print(format_baselines(score_baselines(bench, args.out)))
+        _forget(args.out)
+    with loading():
+        from flashdex.recipe import Recipe, compose, expect_kind
+        from flashdex.training.baselines import format_baselines, score_baselines
+        from flashdex.training.build import RunBuilder
+
+        recipe = compose(args.recipe, args.overrides)
+    bench = RunBuilder.from_recipe(expect_kind(recipe, Recipe, where="baselines"))
+    say(format_baselines(score_baselines(bench, args.out)))
     return 0
+
+
+def _forget(path: Path) -> None:
+    """Remove the scores of another time, and say at once what cannot be written."""
+    try:
+        path.unlink(missing_ok=True)
+        path.touch()
+        path.unlink()
+    except OSError as error:
+        raise FlashdexError(
+            f"--out: {path} cannot be written ({error.strerror}). Give a file in a "
+            "folder that is there."
+        ) from error

@@ -14,8 +14,11 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import flashdex
 from flashdex.cli.data import Handler, add_data_verbs
-from flashdex.errors import FlashdexError
+from flashdex.cli.interrupt import INTERRUPTED, loading
+from flashdex.cli.terminal import Formatter, path, say, set_up_streams
+from flashdex.errors import FlashdexError, MissingExtraError, nearest
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -28,16 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # torch is first imported, so it has to stand before every lazy import below.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # likewise, by torchrl
-    parser = make_parser()
-    args, rest = parser.parse_known_args(argv)
-    _take_overrides(parser, args, rest)
-    if args.debug:
-        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    logging.basicConfig(
-        level=logging.DEBUG if args.debug else logging.INFO,
-        format="%(asctime)s %(name)s: %(message)s",
-        datefmt="%H:%M:%S",
-    )
+    with loading():
+        set_up_streams()
+        args = _read_arguments(sys.argv[1:] if argv is None else list(argv))
+        _set_up_logging(debug=args.debug)
     try:
         if getattr(args, "allow", None):
             from flashdex.envs.mdp.term import allow
@@ -47,13 +44,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FlashdexError as error:
         if args.debug:
             raise
-        print(f"flashdex {args.verb}: {error}", file=sys.stderr)
+        say(f"flashdex {args.verb}: {error}", error=True)
         return 2
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:  # `flashdex ls | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def _set_up_logging(*, debug: bool) -> None:
+    handler = logging.StreamHandler()
+    handler.setFormatter(Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    # of other packages only what is wrong: OpenGL reports what it has not found
+    level = logging.DEBUG if debug else logging.WARNING
+    logging.basicConfig(level=level, handlers=[handler])
+    logging.getLogger("flashdex").setLevel(min(level, logging.INFO))
+
+
+def _read_arguments(words: list[str]) -> argparse.Namespace:
+    """Read the words after `flashdex`; what is wrong with them ends with 2."""
+    parser = make_parser()
+    (verbs,) = (list(a.choices or ()) for a in parser._actions if a.dest == "verb")
+    first = next((word for word in words if not word.startswith("-")), None)
+    if first is not None and first not in verbs:
+        known = ", ".join(verbs)
+        parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} Verbs: {known}")
+    args, rest = parser.parse_known_args(words)
+    _take_overrides(parser, args, rest)
+    return args
 
 
 def _take_overrides(
@@ -81,6 +100,9 @@ def make_parser() -> argparse.ArgumentParser:
         description="From recorded human hand-object motions to robot-hand "
         "trajectories that hold up in physics.",
     )
+    parser.add_argument(
+        "--version", action="version", version=f"flashdex {flashdex.__version__}"
+    )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:
@@ -94,7 +116,8 @@ def make_parser() -> argparse.ArgumentParser:
     )
     verb.add_argument("overrides", nargs="*", metavar="key=value")
     _add_allow(verb)
-    add("ls", _ls, "list recipes with what they promise, and sources of recordings")
+    verb = add("ls", _ls, "list recipes and what they promise, options, sources, hands")
+    verb.add_argument("--json", action="store_true", help="print JSON")
     _add_recipe_verbs(add)
     add_data_verbs(add)
     _add_run_verbs(add)
@@ -113,12 +136,18 @@ def _add_allow(verb: argparse.ArgumentParser) -> None:
 def _add_recipe_verbs(
     add: Callable[[str, Handler, str], argparse.ArgumentParser],
 ) -> None:
-    verb = add("cp", _cp, "copy a recipe to edit it")
-    verb.add_argument("recipe", help="name or path")
-    verb.add_argument("dest", help="new file or folder")
+    verb = add("cp", _cp, "copy a recipe, or an option of one, to edit it")
+    verb.add_argument("recipe", help="name or path, or GROUP/OPTION: ablation/ppo")
+    verb.add_argument("dest", type=path, help="new file or folder")
 
-    verb = add("validate", _validate, "find every mistake in recipes")
-    verb.add_argument("paths", nargs="+", metavar="PATH", help="recipe or folder")
+    verb = add("validate", _validate, "find every mistake in recipes and options")
+    verb.add_argument(
+        "paths",
+        type=path,
+        nargs="+",
+        metavar="PATH",
+        help="recipe, option of a group, or folder",
+    )
     _add_allow(verb)
 
 
@@ -129,7 +158,7 @@ def _add_run_verbs(
     verb.add_argument("recipe", nargs="?", help="name or path")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
     one = verb.add_mutually_exclusive_group()
-    one.add_argument("--resume", type=Path, metavar="RUN", help="continue a run")
+    one.add_argument("--resume", type=path, metavar="RUN", help="continue a run")
     one.add_argument(
         "-m", "--multirun", action="store_true", help="one run for each of key=a,b"
     )
@@ -139,82 +168,104 @@ def _add_run_verbs(
     _add_allow(verb)
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
     verb.add_argument("overrides", nargs="*", metavar="key=value")
     _add_allow(verb)
 
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
 
     verb = add("score", _score, "score stored rollouts by every criterion")
     verb.add_argument(
-        "files", type=Path, nargs="+", metavar="FILE", help="rollout .npz"
+        "files", type=path, nargs="+", metavar="FILE", help="rollout .npz"
     )
     verb.add_argument("--json", action="store_true", help="print JSON")
 
     verb = add("report", _report, "write report.html of a run again")
-    verb.add_argument("run_dir", type=Path, metavar="RUN")
+    verb.add_argument("run_dir", type=path, metavar="RUN")
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from flashdex.cli.doctor import examine, examine_recipe, format_report
-
     if args.recipe is not None:
-        report, fits = examine_recipe(args.recipe, args.overrides)
-        print(report)
-        return int(not fits)
-    findings = examine()
-    print(format_report(findings))
+        return _doctor_recipe(args)
+    with loading():
+        from flashdex.cli.doctor import examine, format_report
+
+        findings = examine()
+    say(format_report(findings))
     return int(any(finding.status == "missing" for finding in findings))
 
 
-def _ls(args: argparse.Namespace) -> int:
-    from flashdex.datasets import format_sources
-    from flashdex.recipe.store import format_listing, list_recipes
+def _doctor_recipe(args: argparse.Namespace) -> int:
+    with loading():
+        from flashdex.cli.doctor import examine_recipe
 
-    print(format_listing(list_recipes()))
-    print(format_sources())
+        try:
+            report, fits = examine_recipe(args.recipe, args.overrides)
+        except MissingExtraError as error:  # that is an answer, too
+            report, fits = str(error), False
+    say(report)
+    return int(not fits)
+
+
+def _ls(args: argparse.Namespace) -> int:
+    from flashdex.cli.listing import listing, listing_json
+
+    say(listing_json() if args.json else listing())
     return 0
 
 
 def _cp(args: argparse.Namespace) -> int:
     from flashdex.recipe import copy_recipe
 
-    print(copy_recipe(args.recipe, args.dest))
+    say(str(copy_recipe(args.recipe, args.dest)))
     return 0
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from flashdex.recipe.merge import validate_paths
+    with loading():
+        from flashdex.recipe.merge import validate_paths
 
-    for path in validate_paths(args.paths):
-        print(f"ok  {path}")
+        found = validate_paths(args.paths)
+    for file in found:
+        say(f"ok  {file}")
     return 0
 
 
 def _train(args: argparse.Namespace) -> int:
-    from flashdex.recipe import compose, compose_runs, dump_recipe
-    from flashdex.training.run_dir import load_run_recipe, resume, train
-
     if args.resume is not None:
-        words = [args.recipe, *args.overrides] if args.recipe else args.overrides
-        if args.cfg:
-            print(dump_recipe(load_run_recipe(args.resume, words)), end="")
-        else:
-            _show_run(resume(args.resume, words))
-        return 0
+        return _resume(args)
     if args.recipe is None:
         raise FlashdexError("give a recipe (see `flashdex ls`) or --resume RUN")
-    if args.multirun:
-        recipes = compose_runs(args.recipe, args.overrides)
-    else:
-        recipes = [compose(args.recipe, args.overrides)]
+    with loading():
+        from flashdex.recipe import compose, compose_runs, dump_recipe
+
+        if args.multirun:
+            recipes = compose_runs(args.recipe, args.overrides)
+        else:
+            recipes = [compose(args.recipe, args.overrides)]
     if args.cfg:
-        print("---\n".join(dump_recipe(recipe) for recipe in recipes), end="")
+        say("---\n".join(dump_recipe(recipe) for recipe in recipes).rstrip())
         return 0
+    with loading():
+        from flashdex.training.run_dir import train
+
     for recipe in recipes:
         if not _show_run(train(recipe, args.overrides)):
             break
+    return 0
+
+
+def _resume(args: argparse.Namespace) -> int:
+    with loading():
+        from flashdex.recipe import dump_recipe
+        from flashdex.training.run_dir import load_run_recipe, resume
+
+    words = [args.recipe, *args.overrides] if args.recipe else args.overrides
+    if args.cfg:
+        say(dump_recipe(load_run_recipe(args.resume, words)).rstrip())
+    else:
+        _show_run(resume(args.resume, words))
     return 0
 
 
@@ -224,62 +275,70 @@ def _show_run(run_dir: Path) -> bool:
     from flashdex.training.session import SIGNAL, ended_by
 
     if ended_by(run_dir) == SIGNAL:
-        print(f"stopped; go on with: flashdex train --resume {run_dir}")
+        say(f"stopped; go on with: flashdex train --resume {run_dir}")
         return False
-    print(run_summary(run_dir))
+    say(run_summary(run_dir))
     return True
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from flashdex.reports.run.terminal import evaluation_table
-    from flashdex.training.run_dir import evaluate
+    with loading():
+        from flashdex.reports.run.terminal import evaluation_table
+        from flashdex.training.run_dir import evaluate
 
     found = evaluate(args.run_dir, args.overrides)
     if "motions" in found:
-        print(evaluation_table(found["motions"], found["totals"]))
+        say(evaluation_table(found["motions"], found["totals"]))
     else:
-        print(json.dumps(found, indent=1))
+        say(json.dumps(found, indent=1))
     return 0
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from flashdex.recipe import require_motions
-    from flashdex.reports.run.terminal import finding_lines, replay_line
-    from flashdex.rollouts.verify import verify_run
-    from flashdex.training.loaded import open_truth
+    with loading():
+        from flashdex.recipe import require_motions
+        from flashdex.reports.run.terminal import finding_lines, replay_line
 
-    require_motions(args.run_dir)
+        require_motions(args.run_dir)
+        from flashdex.rollouts.verify import verify_run
+        from flashdex.training.loaded import open_truth
+
     truth, why = open_truth(args.run_dir)
     verified = verify_run(args.run_dir, truth)
     for one in verified.rollouts:
-        print(replay_line(one.motion, one.stored, one.found, holds=one.holds))
+        say(replay_line(one.motion, one.stored, one.found, holds=one.holds))
     for line in finding_lines(verified.findings, why):
-        print(line)
+        say(line)
     return 0 if verified.holds else 1
 
 
 def _score(args: argparse.Namespace) -> int:
-    from flashdex.reports.run.terminal import finding_lines, score_table
-    from flashdex.rollouts.rollout import Rollout
-    from flashdex.rollouts.verify import faults, verify_file
+    absent = [str(file) for file in args.files if not file.is_file()]
+    if absent:
+        raise FlashdexError(f"{', '.join(absent)}: there is no such file")
+    with loading():
+        from flashdex.reports.run.terminal import finding_lines, score_table
+        from flashdex.rollouts.rollout import Rollout
+        from flashdex.rollouts.verify import faults, verify_file
 
-    found = {str(path): Rollout.load(path).score() for path in args.files}
-    findings = {str(path): verify_file(path) for path in args.files}
+    found = {str(file): Rollout.load(file).score() for file in args.files}
+    findings = {str(file): verify_file(file) for file in args.files}
     if args.json:
         plain = {f: {n: v.to_dict() for n, v in s.items()} for f, s in found.items()}
-        print(json.dumps(plain, indent=1))
+        say(json.dumps(plain, indent=1))
     else:
-        print("\n\n".join(score_table(f, s) for f, s in found.items()))
+        say("\n\n".join(score_table(f, s) for f, s in found.items()))
     every = [finding for some in findings.values() for finding in some]
     for line in finding_lines(every):
-        print(line, file=sys.stderr if args.json else sys.stdout)
+        say(line, error=args.json)
     return 1 if faults(every) else 0
 
 
 def _report(args: argparse.Namespace) -> int:
-    from flashdex.recipe import require_motions
-    from flashdex.reports.run.report import write_report
+    with loading():
+        from flashdex.recipe import require_motions
+        from flashdex.reports.run.report import write_report
 
     require_motions(args.run_dir)
-    print(write_report(args.run_dir))
+    say(str(write_report(args.run_dir)))
     return 0

@@ -8,11 +8,12 @@ lives elsewhere.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 from pathlib import Path
 
-from flashdex.datasets.source import Recording, Source, SourceOptions
+from flashdex.datasets.source import Recording, Source, SourceOptions, is_named
 from flashdex.errors import DemoError, UnknownSourceError
 
 MANO_HINT = (
@@ -31,26 +32,45 @@ def register(source: Source) -> Source:
 
 def source_names() -> list[str]:
     """All sources, in alphabetical order; no reader is imported."""
-    return sorted({*_modules(), *REGISTERED})
+    return sorted({*_files(), *REGISTERED})
+
+
+def describe_sources() -> dict[str, str]:
+    """What each source reads, by its name; no reader is imported."""
+    found = {name: _about(file) for name, (file, _) in _files().items()}
+    found |= {name: source.about for name, source in REGISTERED.items()}
+    return {name: found[name] for name in source_names()}
+
+
+def _about(file: Path) -> str:
+    """The text ``about`` of a reader's ``SOURCE``, where it is written out."""
+    for line in ast.parse(file.read_text(encoding="utf-8")).body:
+        call = line.value if isinstance(line, ast.Assign) else None
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "Source":
+            texts = {k.arg: k.value for k in call.keywords}
+            if isinstance(about := texts.get("about"), ast.Constant):
+                return str(about.value)
+    return ""
 
 
 def get_source(name: str) -> Source:
     """The reader of that name; an ``UnknownSourceError`` names the known ones."""
-    modules = _modules()
+    files = _files()
     if name in REGISTERED:
         return REGISTERED[name]
-    if name not in modules:
+    if name not in files:
         raise UnknownSourceError(name, source_names())
-    return importlib.import_module(modules[name]).SOURCE
+    return importlib.import_module(files[name][1]).SOURCE
 
 
-def _modules() -> dict[str, str]:
+def _files() -> dict[str, tuple[Path, str]]:
+    """File and module of each reader, by name."""
     found = {}
     for folder in map(Path, __path__):
         for file in (*folder.glob("*.py"), *folder.glob("*/reader.py")):
             if DEFINED.search(file.read_text(encoding="utf-8")):
                 parts = file.relative_to(folder).with_suffix("").parts
-                found[parts[0]] = ".".join([__name__, *parts])
+                found[parts[0]] = file, ".".join([__name__, *parts])
     return found
 
 
@@ -80,12 +100,29 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
         raise DemoError(f"{source}: cannot be read: {error}.") from error
     if not recordings:
         raise DemoError(f"{source}: no recordings in {path}.")
-    return recordings if options.limit is None else recordings[: options.limit]
+    return _select(recordings, options)
+
+
+def _select(recordings: list[Recording], options: SourceOptions) -> list[Recording]:
+    """Recordings that are asked for, in the order in which they are.
+
+    A motion is called like its recording, or like it and a piece of it: where a name is
+    that of no recording, all are needed to find it.
+    """
+    if options.select is None:
+        return recordings if options.limit is None else recordings[: options.limit]
+    chosen: dict[str, Recording] = {}
+    for pattern in options.select:
+        found = {r.name: r for r in recordings if is_named(r.name, pattern)}
+        if not found:
+            return recordings
+        chosen |= {name: r for name, r in found.items() if name not in chosen}
+    return list(chosen.values())[: options.limit]
 
 
 def format_sources() -> str:
     """One line a source: its name and what it reads."""
-    names = source_names()
-    width = max(map(len, names))
-    lines = [f"  {name:<{width}}  {get_source(name).about}" for name in names]
+    found = describe_sources()
+    width = max(map(len, found))
+    lines = [f"  {name:<{width}}  {about}" for name, about in found.items()]
     return "\n".join(["recordings (flashdex prepare --source NAME):", *lines])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ class SourceOptions:
     models: Path | None = None  # folder of the object models, where it lies apart
     splits: Path | None = None  # file of the split of each recording, if apart
     seed: int = 0  # for sources that make motions up
+    # names or globs of motions; recordings that can have none of them are left out
+    select: tuple[str, ...] | None = None
     limit: int | None = None  # of recordings; a made-up source makes exactly so many
 
     def folder(self, name: str) -> Path:
@@ -27,6 +30,11 @@ class SourceOptions:
         value = getattr(self, name)
         assert value is not None, name
         return value
+
+
+def is_named(name: str, pattern: str) -> bool:
+    """Whether a name is meant: literally, or by a glob that it matches."""
+    return name == pattern or fnmatch.fnmatchcase(name, pattern)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-import flashdex.hands
 from flashdex.errors import FlashdexError, UnknownHandError
+from flashdex.hands import known_hands
 from flashdex.hands.gains import NUM_WRIST_JOINTS, Gains, GainsPreset
 from flashdex.keys import FINGERS, SIDES, Side
 from flashdex.system.mjcf import check_mjcf
@@ -97,12 +97,6 @@ class HandSpec:
     def wrist_axes(self) -> Floats:
         """Axes of the wrist joints, each in the frame of its own link, (6, 3)."""
         return self.joint_axis[:NUM_WRIST_JOINTS]
-
-
-def known_hands() -> list[str]:
-    """Names of the hands: folders of the package that hold models."""
-    models = (Path(root).glob("*/left.xml") for root in flashdex.hands.__path__)
-    return sorted({model.parent.name for found in models for model in found})
 
 
 def load_hand(name: str) -> dict[Side, HandSpec]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flashdex.recipe.tasks import GymRecipe as GymRecipe
     from flashdex.recipe.tasks import expect_kind as expect_kind
 
-_PARTS = ("store", "run", "motions", "schema", "tasks", "check", "merge")
+_PARTS = ("reader", "store", "run", "motions", "schema", "tasks", "check", "merge")
 
 
 def __getattr__(name: str) -> Any:

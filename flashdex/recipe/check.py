@@ -22,10 +22,11 @@ from flashdex.algorithms.base import config_class
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.term import KINDS, Kind, default_mapping, find_term, registry
 from flashdex.errors import FlashdexError, RecipeError, nearest
-from flashdex.recipe.schema import RunRecipe
+from flashdex.recipe.schema import PATHS, RunRecipe
 from flashdex.recipe.tasks import split_foreign
 
 R = TypeVar("R", bound=RunRecipe)
+_NAME_BYTES, _PATH_BYTES = 100, 2000
 # Stand-ins for required values that are absent; the recipe is refused anyway.
 _STAND_INS: dict[type, Any] = {int: 1, str: "", float: 1.0}
 _EXPECTED = {
@@ -60,7 +61,34 @@ def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
     # An algorithm may add keys.
     cls = config_class(algo.get("kind") if isinstance(algo, Mapping) else None)
     recipe = dataclasses.replace(recipe, algo=_build(cls, algo, "algo", problems))
-    return recipe, problems + kind.find_conflicts(recipe)
+    return recipe, problems + _find_names(recipe) + kind.find_conflicts(recipe)
+
+
+def _find_names(recipe: RunRecipe) -> list[str]:
+    """Return one line for each text that no file or folder can be called by."""
+    problems = []
+    for key in ("name", "ablation"):  # parts of the name of the run's folder
+        text = getattr(recipe, key)
+        if not text.strip() or "/" in text or text.startswith(".") or not _fits(text):
+            problems.append(
+                f"{key}: {_shown(text)} cannot be part of a folder's name; give up to "
+                f"{_NAME_BYTES} bytes without '/', not beginning with a dot"
+            )
+    for key in PATHS:
+        path: Any = functools.reduce(
+            lambda part, word: getattr(part, word, None), key.split("."), recipe
+        )
+        long = max(path.split("/"), key=len) if path is not None else ""
+        if path is not None and (
+            not path.strip() or len(path) > _PATH_BYTES or not _fits(long, 255)
+        ):
+            problems.append(f"{key}: {_shown(path)} cannot be a path; null is none")
+    return problems
+
+
+def _fits(text: str, size: int = _NAME_BYTES) -> bool:
+    """Whether a text can be shown, and written as the name of a file."""
+    return text.isprintable() and len(text.encode(errors="replace")) <= size
 
 
 def validate(recipe: R) -> R:
@@ -144,6 +172,8 @@ def _build(cls: type, data: Any, path: str, problems: list[str]) -> Any:
             # Strict, or "1" were a number; in JSON a mapping still is a dataclass.
             return _adapter(cls).validate_json(json.dumps(root), strict=True)[0]
         except ValidationError as found:
+            if not found.errors()[0]["loc"]:
+                raise RecipeError([f"{path}: a text in it is not Unicode"]) from found
             for error in found.errors():
                 where, problem = _explain(cls, error, path)
                 if where not in noted:
@@ -170,13 +200,22 @@ def _explain(cls: type, error: Any, path: str) -> tuple[str, str]:
         return where, _unknown(what, way[-1], known)
     if kind == "literal_error":
         known = re.findall(r"'([^']*)'", limits["expected"])
-        problem = f"{value!r} is not allowed.{nearest(str(value), known)} "
+        problem = f"{_shown(value)} is not allowed.{nearest(str(value)[:99], known)} "
         return where, f"{item}{problem}Allowed: {', '.join(known)}."
     for key in _RANGES.keys() & limits:
-        value, limit = type(limits[key])(value), f"{limits[key]:.12g}"
-        return where, f"{value} must be {_RANGES[key]} {limit}"
+        limit = f"{limits[key]:.12g}"
+        return where, f"{item}{_shown(value)} must be {_RANGES[key]} {limit}"
     expected = _EXPECTED.get(kind, error["msg"])
-    return where, f"{item}expected {expected}, found {value!r}"
+    if kind in ("too_short", "too_long"):
+        least, most = limits.get("min_length"), limits.get("max_length")
+        expected = f"at least {least} entries" if least else f"at most {most} entries"
+    return where, f"{item}expected {expected}, found {_shown(value)}"
+
+
+def _shown(value: Any) -> str:
+    """A value as messages show it: on one line, and not all of a long one."""
+    text = ascii(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 60 else f"{text[:50]}...{text[-8:]}"
 
 
 def _is_item(error: Any) -> bool:

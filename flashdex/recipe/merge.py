@@ -1,243 +1,204 @@
 """From a recipe's name and overrides to a checked recipe.
 
-Hydra merges the files (defaults list, groups, ablations); values, defaults and names
-are then checked here against the dataclasses, because Hydra would stop at the first
-mistake.
+A file names the groups that it is merged with in its list ``defaults``, as Hydra's do;
+values and names are then checked against the dataclasses.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
-import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from omegaconf import OmegaConf
 
 from flashdex.errors import FlashdexError, RecipeError, nearest
 from flashdex.recipe.check import read_recipe
-from flashdex.recipe.schema import RunRecipe
-from flashdex.recipe.store import find_recipe, search_dirs
+from flashdex.recipe.overrides import (
+    Change,
+    apply_changes,
+    expand_home,
+    expand_sweeps,
+    fill_in,
+    merge,
+    parse_overrides,
+)
+from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
+from flashdex.recipe.schema import Recipe, RunRecipe
+from flashdex.recipe.store import (
+    find_option,
+    find_recipe,
+    group_of,
+    known_groups,
+    search_dirs,
+)
 from flashdex.recipe.tasks import kind_of, mark_groups
 
-Groups = dict[str, list[str]]
+Options = dict[str, list[str] | None]
+"""Options chosen for each group; None takes the group out."""
+MAX_FILES = 64
+_PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 
 
-def known_groups(dirs: Sequence[Path]) -> Groups:
-    """Return group name to its options, over all folders of the search path.
+class _Composer:
+    """Merges a recipe with the files that it names, and notes what is wrong."""
 
-    Args:
-        dirs: folder of the recipe first, then where names are looked up. The first
-            may be any folder of the user's, so it adds options but no groups.
-    """
-    groups: dict[str, set[str]] = {}
-    names = {path.parent.name for d in search_dirs() for path in d.glob("*/*.yaml")}
-    for folder in dirs:
-        for path in folder.glob("*/*.yaml"):
-            if path.parent.name in names:
-                groups.setdefault(path.parent.name, set()).add(path.stem)
-    return {name: sorted(options) for name, options in sorted(groups.items())}
+    def __init__(self, folder: Path, problems: list[str]) -> None:
+        self.dirs = [folder, *(d for d in search_dirs() if d != folder)]
+        self.groups = known_groups(folder)
+        self.problems = problems
+        self.chosen: Options = {}  # stronger than what a file says
+        self.used: Options = {}
+        self._open: list[Path] = []
+        self._count = 0
 
+    def choose(self, changes: Sequence[Change]) -> list[Change]:
+        """Take the choices of options out of the changes; return the others."""
+        others = []
+        for change in changes:
+            if change.key not in self.groups:
+                others.append(change)
+                continue
+            options = None if change.is_delete else _options(change.value)
+            good = [self._exists(change.key, option) for option in options or ()]
+            if all(good):
+                self.chosen[change.key] = options
+        return others
 
-def check_option(group: str, option: str, groups: Groups, problems: list[str]) -> bool:
-    """Note a group or an option that does not exist; say whether both do."""
-    if group not in groups:
-        problems.append(
-            f"defaults.{group}: unknown group.{nearest(group, groups)} "
-            f"Allowed: {', '.join(groups)}."
-        )
-    elif option not in groups[group]:
-        problems.append(
-            f"{group}={option}: there is no such {group}."
-            f"{nearest(option, groups[group])} Allowed: {', '.join(groups[group])}."
-        )
-    else:
-        return True
-    return False
+    def compose(self, path: Path) -> dict[str, Any]:
+        """The recipe merged with everything that it and the command line name."""
+        data = self._load(path, None)
+        for group in [g for g in self.chosen if g not in self.used]:
+            data = merge(data, self._group(group, []))
+        return data
 
+    def load_option(self, path: Path, group: str) -> dict[str, Any]:
+        """The file of an option alone, with what it names."""
+        return self._load(path, group)
 
-def check_defaults(
-    path: Path, groups: Groups, problems: list[str]
-) -> tuple[dict[str, list[str]], list[str]]:
-    """Check the defaults list of one file.
-
-    Args:
-        path: the recipe.
-        groups: what exists.
-        problems: where problems are noted.
-
-    Returns:
-        The options of each group it names, and the groups with a wrong option.
-    """
-    named: dict[str, list[str]] = {}
-    broken: list[str] = []
-    has_self = False
-    for entry in _read_defaults(path):
-        has_self = has_self or entry == "_self_"
-        for key, value in entry.items() if isinstance(entry, dict) else ():
-            *words, group = str(key).replace("/", " ").split()
-            _check_entry(group, words, has_self, problems)
-            options = [str(v) for v in (value if isinstance(value, list) else [value])]
-            good = [check_option(group, o, groups, problems) for o in options]
-            named[group] = options
-            if not all(good):
-                broken.append(group)
-    return named, broken
-
-
-def _check_entry(
-    group: str, words: list[str], has_self: bool, problems: list[str]
-) -> None:
-    """Note the two ways in which Hydra would drop a choice without a word."""
-    if "optional" in words:
-        problems.append(
-            f"defaults.{group}: 'optional' hides a misspelt option; leave it out (use "
-            f"'{group}: none' for nothing)"
-        )
-    if group == "ablation" and not has_self:
-        problems.append(
-            "defaults: '_self_' must stand before 'ablation', or the recipe wins and "
-            "the ablation has no effect"
-        )
-
-
-def _read_defaults(path: Path) -> list[Any]:
-    try:
-        data = yaml.safe_load(path.read_text())
-    except yaml.YAMLError:
-        return []  # Hydra reads it next and says where the syntax is wrong
-    entries = data.get("defaults") if isinstance(data, dict) else None
-    return entries if isinstance(entries, list) else []
-
-
-def parse_overrides(texts: Sequence[str]) -> tuple[list[Override], list[str]]:
-    """Parse each override on its own; return the good ones and the problems."""
-    parser = OverridesParser.create()
-    parsed: list[Override] = []
-    problems: list[str] = []
-    for text in texts:
+    def _load(self, path: Path, group: str | None) -> dict[str, Any]:
+        """One file, with what its list of defaults names before and after it."""
+        where = f"{group}/{path.stem}" if group else path.name
+        self._count += 1
+        if path in self._open or self._count > MAX_FILES:
+            way = " -> ".join(p.stem for p in [*self._open, path][-5:])
+            self.problems.append(f"{where}: includes itself, or too many files ({way})")
+            return {}
+        self._open.append(path)
         try:
-            override = parser.parse_override(text)
-        except HydraException:
-            problems.append(
-                f"override '{text}': not understood; write key=value, ~key or "
-                f"group=option"
+            return self._merge(where, read_text(path), group)
+        except RecipeError as error:
+            self.problems += [f"{where}: {problem}" for problem in error.problems]
+            return {}
+        finally:
+            self._open.pop()
+
+    def _merge(self, where: str, text: str, group: str | None) -> dict[str, Any]:
+        body = parse_yaml(text, where=where)
+        entries = body.pop("defaults", None) or []
+        if not isinstance(entries, list):
+            self.problems.append(f"{where}: defaults: expected a list")
+            entries = []
+        package = _PACKAGE.search(text)
+        if package is not None and package[1] != "_global_":
+            self.problems.append(
+                f"{where}: '@package {package[1]}' is not known; _global_ puts the "
+                "values at the top, without the line they belong to the group"
             )
-            continue
-        if override.is_sweep_override():
-            problems.append(f"override '{text}': several values need the flag -m")
-            continue
-        parsed.append(override)
-    return parsed, problems
+        own = {group: body} if group and package is None else body
+        self._note_overrides(entries)
+        merged: dict[str, Any] = {}
+        for i, entry in enumerate(entries):
+            before = entries[:i]
+            merged = merge(merged, own if entry == "_self_" else {})
+            merged = merge(merged, self._entry(where, entry, before, group))
+        return merged if "_self_" in entries else merge(merged, own)
 
+    def _note_overrides(self, entries: list[Any]) -> None:
+        """`override group: option` replaces what the files named before choose."""
+        for entry in entries:
+            for key, value in entry.items() if isinstance(entry, dict) else ():
+                words = str(key).replace("/", " ").split()
+                if words[:-1] == ["override"]:
+                    self.chosen.setdefault(words[-1], _options(value))
 
-def expand_sweeps(texts: Sequence[str]) -> list[list[str]]:
-    """Return one list of overrides a run: the product of all `key=a,b` (flag -m).
+    def _entry(
+        self, where: str, entry: Any, before: list[Any], group: str | None
+    ) -> dict[str, Any]:
+        """What one line of a list of defaults adds."""
+        if entry == "_self_":
+            return {}
+        if isinstance(entry, str):
+            return self._file(entry) if group is None else self._group(group, [entry])
+        if not isinstance(entry, dict) or len(entry) != 1:
+            self.problems.append(f"{where}: defaults: '{entry}' is no 'group: option'")
+            return {}
+        ((key, value),) = entry.items()
+        *words, name = str(key).replace("/", " ").split() or [""]
+        self._check_words(name, words, "_self_" in before)
+        if words == ["override"] and name in self.used:
+            return {}  # the file that names the group has it already
+        return self._group(name, _options(value))
 
-    Example:
-        >>> expand_sweeps(["seed=0,1", "hand=xhand"])
-        [['seed=0', 'hand=xhand'], ['seed=1', 'hand=xhand']]
-    """
-    parser = OverridesParser.create()
-    choices: list[list[str]] = []
-    for text in texts:
-        try:
-            override = parser.parse_override(text)
-        except HydraException as error:
-            raise RecipeError([f"override '{text}': not understood"]) from error
-        if override.is_sweep_override():
-            key = override.get_key_element()
-            choices.append([f"{key}={v}" for v in override.sweep_string_iterator()])
+    def _check_words(self, group: str, words: list[str], has_self: bool) -> None:
+        """Note the ways in which a choice would be dropped without a word."""
+        if "optional" in words:
+            self.problems.append(
+                f"defaults.{group}: 'optional' hides a misspelt option; leave it out "
+                f"(use '{group}: none' for nothing)"
+            )
+        if group == "ablation" and not has_self:
+            self.problems.append(
+                "defaults: '_self_' must stand before 'ablation', or the recipe wins "
+                "and the ablation has no effect"
+            )
+
+    def _file(self, name: str) -> dict[str, Any]:
+        """Another recipe that one is built on."""
+        for folder in self.dirs if "/" not in name else ():
+            if (folder / f"{name}.yaml").is_file():
+                return self._load(folder / f"{name}.yaml", None)
+        self.problems.append(f"defaults: there is no recipe '{name}' to build on")
+        return {}
+
+    def _group(self, group: str, named: list[str] | None) -> dict[str, Any]:
+        """The options of a group that are chosen, or else named."""
+        options = self.chosen.get(group, named)
+        self.used[group] = options
+        merged: dict[str, Any] = {}
+        for option in options or ():
+            if self._exists(group, option):
+                merged = merge(merged, self._load(self._find(group, option), group))
+        return merged
+
+    def _find(self, group: str, option: str) -> Path:
+        paths = [folder / group / f"{option}.yaml" for folder in self.dirs]
+        return next(path for path in paths if path.is_file())
+
+    def _exists(self, group: str, option: str) -> bool:
+        """Note a group or an option that does not exist; say whether both do."""
+        known = self.groups
+        if group not in known:
+            self.problems.append(
+                f"defaults.{group}: unknown group.{nearest(group, known)} "
+                f"Allowed: {', '.join(known)}."
+            )
+        elif option not in known[group]:
+            self.problems.append(
+                f"{group}={option}: there is no such {group}."
+                f"{nearest(option, known[group])} Allowed: {', '.join(known[group])}."
+            )
         else:
-            choices.append([text])
-    return [list(run) for run in itertools.product(*choices)]
+            return True
+        return False
 
 
-def choose_groups(
-    parsed: Sequence[Override], groups: Groups, problems: list[str]
-) -> dict[str, list[str] | None]:
-    """Return the options chosen for each group; None takes the group out.
-
-    Args:
-        parsed: all overrides.
-        groups: groups and their options.
-        problems: where unknown options are noted; those choices are left out.
-    """
-    chosen: dict[str, list[str] | None] = {}
-    for override in parsed:
-        group = override.key_or_group
-        if group not in groups:
-            continue
-        if override.is_delete():
-            chosen[group] = None
-            continue
-        value = override.value()
-        options = [str(v) for v in (value if isinstance(value, list) else [value])]
-        # A list, so that every wrong option is noted, not only the first.
-        good = [check_option(group, option, groups, problems) for option in options]
-        if all(good):
-            chosen[group] = options
-    return chosen
-
-
-def hydra_choices(
-    chosen: Mapping[str, list[str] | None], named: Collection[str]
-) -> list[str]:
-    """Write group choices as Hydra overrides.
-
-    Args:
-        chosen: options a group; None takes the group out.
-        named: groups in the recipe's own defaults list. Others are appended, which
-            puts them behind `_self_`.
-    """
-    texts: list[str] = []
-    for group, options in chosen.items():
-        if options is None:
-            texts += [f"~{group}"] if group in named else []
-        else:
-            add = "" if group in named else "+"
-            value = options[0] if len(options) == 1 else f"[{','.join(options)}]"
-            texts.append(f"{add}{group}={value}")
-    return texts
-
-
-def apply_values(
-    config: DictConfig,
-    parsed: Sequence[Override],
-    groups: Groups,
-    problems: list[str],
-) -> None:
-    """Apply the overrides that set or delete a value, in place."""
-    for override in parsed:
-        key = override.key_or_group
-        if key in groups:
-            continue
-        try:
-            if override.is_delete():
-                _delete(config, key)
-            else:
-                OmegaConf.update(config, key, override.value(), force_add=True)
-        except (OmegaConfBaseException, KeyError, TypeError, AttributeError) as error:
-            detail = error.args[0] if isinstance(error, KeyError) else "no such place"
-            problems.append(f"override '{override.input_line}': {detail}")
-
-
-def _delete(config: DictConfig, key: str) -> None:
-    parent_key, _, name = key.rpartition(".")
-    parent = OmegaConf.select(config, parent_key) if parent_key else config
-    known = [str(k) for k in parent] if isinstance(parent, DictConfig) else []
-    if name not in known:
-        allowed = f" There are: {', '.join(known)}." if known else ""
-        raise KeyError(f"{key} does not exist.{nearest(name, known)}{allowed}")
-    del parent[name]
+def _options(value: Any) -> list[str] | None:
+    if value is None:
+        return None
+    return [str(option) for option in (value if isinstance(value, list) else [value])]
 
 
 def compose(
@@ -282,24 +243,40 @@ def inspect_recipe(
 ) -> tuple[RunRecipe, list[str]]:
     """Compose without raising: the recipe (unusable with problems) and the problems."""
     path = find_recipe(name_or_path)
-    dirs = [path.parent, *(d for d in search_dirs() if d != path.parent)]
-    groups = known_groups(dirs)
-    parsed, problems = parse_overrides(overrides)
-    named, broken = check_defaults(path, groups, problems)
-    chosen = choose_groups(parsed, groups, problems)
-    # A default that does not exist is taken out so that the rest can be checked,
-    # unless the command line has replaced it.
-    chosen = dict.fromkeys(broken) | chosen
-    merged = _merge_files(path, dirs, hydra_choices(chosen, named), problems)
-    apply_values(merged, parsed, groups, problems)
-    data = _to_container(merged, problems)
-    data.setdefault("name", path.stem)
-    groups_used = named | chosen
-    ablations = groups_used.get("ablation")
-    if ablations:
-        data["ablation"] = "+".join(ablations)
-    data = mark_groups(data, [g for g, options in groups_used.items() if options])
-    recipe, found = read_recipe(data)
+    changes, problems = parse_overrides(overrides)
+    composer = _Composer(path.parent, problems)
+    changes = composer.choose(changes)
+    # a file may be called by bytes that are no text
+    stem = path.stem.encode("utf-8", "replace").decode()
+    data = merge({"name": stem}, composer.compose(path))
+    used = {group: options for group, options in composer.used.items() if options}
+    if "ablation" in used:
+        data["ablation"] = "+".join(used["ablation"] or ())
+    return _read(data, changes, problems, groups=list(used))
+
+
+def inspect_option(path: Path, group: str) -> list[str]:
+    """The problems of an option of a group, on a recipe with nothing else in it."""
+    problems: list[str] = []
+    least = {"name": path.stem, "total_env_steps": 10**9}
+    data = merge(least, _Composer(path.parent, problems).load_option(path, group))
+    if kind_of(data).root is Recipe and not data.get("motions"):
+        data["motions"] = {"source": "procedural"}
+    return _read(data, [], problems)[1]
+
+
+def _read(
+    data: dict[str, Any],
+    changes: Sequence[Change],
+    problems: list[str],
+    groups: Sequence[str] = (),
+) -> tuple[RunRecipe, list[str]]:
+    """Apply changes to composed values and check the whole."""
+    data = merge(kind_of(data).make_base(), data)
+    apply_changes(data, changes, problems)
+    fill_in(data, problems)
+    expand_home(data)
+    recipe, found = read_recipe(mark_groups(data, groups))
     return recipe, problems + found
 
 
@@ -310,72 +287,42 @@ def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
         path: the file, `recipe.yaml` of a run for example.
         overrides: values to change (`key=value`); groups cannot be chosen any more.
     """
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise FlashdexError(f"{path}: there is no such recipe file")
-    try:
-        config = OmegaConf.load(path)
-    except (YAMLError, OmegaConfBaseException) as error:
-        raise RecipeError([" ".join(str(error).split())], where=str(path)) from error
-    if not isinstance(config, DictConfig):
-        raise RecipeError(["expected keys and values"], where=str(path))
-    return _change(config, overrides, where=str(path))
+    return _change(read_yaml(Path(path)), overrides, where=str(path))
 
 
 def dump_recipe(recipe: RunRecipe, path: str | Path | None = None) -> str:
     """Return the complete recipe as YAML, and write it when a path is given."""
     text = OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(recipe)))
     if path is not None:
-        Path(path).write_text(text)
+        Path(path).write_text(text, encoding="utf-8")
     return text
 
 
 def override_recipe(recipe: RunRecipe, overrides: Sequence[str]) -> RunRecipe:
     """Change values of a composed recipe."""
-    config = OmegaConf.create(dataclasses.asdict(recipe))
-    return _change(config, overrides, where=f"recipe {recipe.name}")
+    data = dataclasses.asdict(recipe)
+    return _change(data, overrides, where=f"recipe {recipe.name}")
 
 
-def _change(config: DictConfig, overrides: Sequence[str], *, where: str) -> RunRecipe:
-    parsed, problems = parse_overrides(overrides)
-    apply_values(config, parsed, {}, problems)
-    recipe, found = read_recipe(_to_container(config, problems))
+def _change(data: dict[str, Any], overrides: Sequence[str], *, where: str) -> RunRecipe:
+    changes, problems = parse_overrides(overrides)
+    apply_changes(data, changes, problems)
+    fill_in(data, problems)
+    expand_home(data)
+    recipe, found = read_recipe(data)
     if problems + found:
         raise RecipeError(problems + found, where=where)
     return recipe
-
-
-def _merge_files(
-    path: Path, dirs: list[Path], choices: list[str], problems: list[str]
-) -> DictConfig:
-    """Let Hydra merge the recipe with its groups; its complaint becomes a problem."""
-    where = ",".join(f"'file://{folder}'" for folder in dirs[1:])
-    search = f"hydra.searchpath=[{where}]"
-    try:
-        with hydra.initialize_config_dir(str(dirs[0]), version_base="1.3"):
-            config = hydra.compose(path.stem, overrides=[search, *choices])
-        OmegaConf.set_struct(config, False)
-        merged = OmegaConf.merge(OmegaConf.create(kind_of(config).make_base()), config)
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        problems.append(f"{path.name}: {' '.join(str(error).split())}")
-        return OmegaConf.create({})
-    assert isinstance(merged, DictConfig)
-    return merged
-
-
-def _to_container(config: DictConfig, problems: list[str]) -> dict[str, Any]:
-    try:
-        data = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:
-        problems.append(" ".join(str(error).split()))
-        data = OmegaConf.to_container(config, resolve=False)
-    return {str(k): v for k, v in data.items()} if isinstance(data, dict) else {}
 
 
 def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
     """Compose every recipe; all problems of all files are raised together.
 
     Args:
-        paths: recipe names, files or folders (the YAML files at their top level).
+        paths: recipes or options of groups, their names, files or folders (the YAML
+            files at their top level).
 
     Returns:
         The files that were checked.
@@ -383,16 +330,23 @@ def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
     files = [file for path in paths for file in _files(path)]
     problems = []
     for file in files:
-        _, found = inspect_recipe(file)
-        problems += [f"{file}: {problem}" for problem in found]
+        problems += [f"{file}: {problem}" for problem in _problems_of(file)]
     if problems:
         raise RecipeError(problems, where=f"{len(files)} recipes checked")
     return files
 
 
+def _problems_of(file: Path) -> list[str]:
+    try:
+        group = group_of(file)
+    except RecipeError as error:
+        return error.problems
+    return inspect_option(file, group) if group else inspect_recipe(file)[1]
+
+
 def _files(path: str | Path) -> list[Path]:
     if not Path(path).is_dir():
-        return [find_recipe(path)]
+        return [find_option(path) or find_recipe(path)]
     files = sorted(Path(path).glob("*.yaml"))
     if not files:
         raise FlashdexError(f"{path}: no recipe (*.yaml) in this folder")

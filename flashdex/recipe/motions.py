@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from flashdex.datasets import source_names
-from flashdex.system.fields import number
+from flashdex.system.fields import SEED_MAX, number
 
 if TYPE_CHECKING:  # the readers that there are; a checker of types cannot know them
     SourceName = str
@@ -31,14 +31,14 @@ class MotionsConfig:
     """Folder with MANO_LEFT and MANO_RIGHT, for sources that need the hand model."""
     models: str | None = None
     """Folder of the object models, where it lies apart from the recordings."""
-    speed: float = number(1.0, above=0)
+    speed: float = number(1.0, low=0.01, high=100)
     """Playback speed of the recordings; 0.5 makes a motion last twice as long."""
     select: list[str] | None = None
     """Names or globs of the motions to keep; null keeps all."""
-    count: int | None = number(None, low=1)
+    count: int | None = number(None, low=1, high=10**6)
     """How many motions to keep or, for procedural ones, to make; null = all."""
-    seed: int = number(0, low=0)
+    seed: int = number(0, low=0, high=SEED_MAX)
     """Seed of procedural motions and of preparation."""
-    control_hz: float = number(60.0, above=0)
+    control_hz: float = number(60.0, low=1, high=10_000)
     """Control rate at which a source is prepared, 1/s; a library keeps its own, which
     must be one over physics.timestep x physics.decimation."""

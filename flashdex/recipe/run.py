@@ -17,18 +17,18 @@ from flashdex.system.fields import number
 class LoopConfig:
     """The loop around the updates: checkpoints, logs, end."""
 
-    checkpoint_every_s: float = number(300.0, above=0)
+    checkpoint_every_s: float = number(300.0, above=0, high=1e9)
     """Seconds between checkpoints."""
-    keep_checkpoints: int = number(3, low=1)
+    keep_checkpoints: int = number(3, low=1, high=10**6)
     """Newest checkpoints kept."""
     checkpoint_replay: bool = False
     """Store new replay rows beside each checkpoint, so that a resumed run learns on at
     once: the disk holds the whole buffer, about 1 kB a row."""
-    log_every_s: float = number(5.0, above=0)
+    log_every_s: float = number(5.0, above=0, high=1e9)
     """Seconds between log records."""
-    wall_limit_s: float | None = number(None, above=0)
+    wall_limit_s: float | None = number(None, above=0, high=1e9)
     """Stop cleanly after this many seconds, all sessions together; null = never."""
-    torch_threads: int = number(0, low=0)
+    torch_threads: int = number(0, low=0, high=256)
     """Threads of the learner on a CPU; 0 = torch's choice. With small networks more
     threads wait for each other longer than they compute."""
 

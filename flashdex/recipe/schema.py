@@ -11,7 +11,10 @@ from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.recipe.motions import MotionsConfig
 from flashdex.recipe.run import LoggerConfig, TrainConfig
-from flashdex.system.fields import number
+from flashdex.system.fields import SEED_MAX, number
+
+PATHS = ("run_dir", *(f"motions.{k}" for k in ("library", "input", "mano", "models")))
+"""Keys whose value is a path, whatever is in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,11 +23,11 @@ class Expectation:
 
     metric: str
     """Key of `metrics.jsonl`."""
-    at_env_steps: int = number(dataclasses.MISSING, low=1)
+    at_env_steps: int = number(dataclasses.MISSING, low=1, high=10**12)
     """Env steps at which it is read."""
-    min: float | None = None
+    min: float | None = number(None, low=-1e15, high=1e15)
     """Smallest accepted value."""
-    max: float | None = None
+    max: float | None = number(None, low=-1e15, high=1e15)
     """Largest accepted value."""
 
 
@@ -34,11 +37,11 @@ class RunRecipe:
 
     name: str
     """Name of the recipe; taken from the file name when absent."""
-    total_env_steps: int = number(dataclasses.MISSING, low=1)
+    total_env_steps: int = number(dataclasses.MISSING, low=1, high=10**12)
     """Budget, control steps summed over worlds."""
     ablation: str = "none"
     """Ablation files that were applied; set by composing, not by hand."""
-    seed: int = number(0, low=0)
+    seed: int = number(0, low=0, high=SEED_MAX)
     """Seed of everything that is drawn."""
     run_dir: str | None = None
     """Folder of the run; null = runs/<name>-<ablation>-s<seed>."""

@@ -5,15 +5,18 @@ Nothing here imports the schema, which would import torch.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 import flashdex
-from flashdex.errors import FlashdexError, UnknownRecipeError
+from flashdex.errors import (
+    FlashdexError,
+    RecipeError,
+    UnknownOptionError,
+    UnknownRecipeError,
+)
+from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
 
 DEFAULT_TASK, GYM_TASK = "retarget", "gym"
 
@@ -30,6 +33,8 @@ class RecipeEntry:
     """First comment line: what it is."""
     expect: list[dict[str, Any]]
     """Promised numbers."""
+    problem: str = ""
+    """Why it cannot be read, empty where it can."""
 
 
 def package_dir() -> Path:
@@ -55,39 +60,103 @@ def find_recipe(name_or_path: str | Path) -> Path:
     text = str(name_or_path)
     if text.endswith((".yaml", ".yml")) or "/" in text:
         path = Path(text)
-        if path.is_file():
+        if is_file(path):
             return path.resolve()
         raise FlashdexError(
             f"recipe {path}: there is no such file. Give the path of a YAML file or "
             f"one of the names that `flashdex ls` lists."
         )
     for folder in search_dirs():
-        if (folder / f"{text}.yaml").is_file():
+        if is_file(folder / f"{text}.yaml"):
             return folder / f"{text}.yaml"
     raise UnknownRecipeError(text, [entry.name for entry in list_recipes()])
 
 
+def is_file(path: Path) -> bool:
+    """Whether it is a regular file; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, not to be entered, with NUL in it
+        return False
+
+
+def find_option(name: str | Path) -> Path | None:
+    """Return the file of an option by name, `ablation/no_future`; None if none is."""
+    group, _, option = str(name).removesuffix(".yaml").partition("/")
+    for folder in search_dirs() if option and "/" not in option else ():
+        if is_file(folder / group / f"{option}.yaml"):
+            return folder / group / f"{option}.yaml"
+    known = known_groups()
+    if group in known and option and not is_file(Path(name)):
+        raise UnknownOptionError(option, known[group], where=group)
+    return None
+
+
+def group_of(path: Path) -> str | None:
+    """Return the group that a file is an option of; None for a recipe.
+
+    Raises:
+        RecipeError: it cannot be read.
+    """
+    text, group = read_text(path), path.resolve().parent.name
+    if "# @package " in text:
+        return group
+    is_whole = "total_env_steps" in text  # every recipe gives it, an option need not
+    return group if group in known_groups() and not is_whole else None
+
+
+def known_groups(folder: Path | None = None) -> dict[str, list[str]]:
+    """Return group name to its options, over all folders of the search path.
+
+    Args:
+        folder: that of a recipe. It may be any of the user's, so it adds options, but
+            no groups.
+    """
+    dirs = search_dirs()
+    names = {path.parent.name for d in dirs for path in d.glob("*/*.yaml")}
+    groups: dict[str, set[str]] = {}
+    for path in [p for d in (folder, *dirs) if d for p in d.glob("*/*.yaml")]:
+        if path.parent.name in names and is_file(path):
+            groups.setdefault(path.parent.name, set()).add(path.stem)
+    return {name: sorted(options) for name, options in sorted(groups.items())}
+
+
 def list_recipes() -> list[RecipeEntry]:
     """Return every recipe that can be trained by name, sorted by name."""
+    return _list("*.yaml")
+
+
+def list_options() -> dict[str, list[RecipeEntry]]:
+    """Return the options of every group, by the name of the group."""
+    return {group: _list(f"{group}/*.yaml") for group in known_groups()}
+
+
+def _list(pattern: str) -> list[RecipeEntry]:
     found: dict[str, RecipeEntry] = {}
     for folder in search_dirs():
-        for path in sorted(folder.glob("*.yaml")):
+        for path in sorted(folder.glob(pattern)):
             found.setdefault(path.stem, _read_entry(path))
     return [found[name] for name in sorted(found)]
 
 
 def _read_entry(path: Path) -> RecipeEntry:
-    text = path.read_text()
-    comments = [line[1:].strip() for line in text.splitlines() if line.startswith("#")]
+    """What a file says of itself; what is wrong with it is said, never raised."""
     try:
-        data = yaml.safe_load(text) or {}
-    except yaml.YAMLError:  # `flashdex validate` says what is wrong with it
-        data = {}
+        text = read_text(path)
+        data, problem = parse_yaml(text, where=path.stem), ""
+    except RecipeError as error:
+        text, data, problem = "", {}, error.problems[0]
+    comments = [line[1:].strip() for line in text.splitlines() if line.startswith("#")]
+    said = [line for line in comments if not line.startswith("@package")]
+    expect = data.get("expect")
     return RecipeEntry(
         name=path.stem,
         path=path,
-        headline=comments[0] if comments else "",
-        expect=list(data.get("expect") or []),
+        headline=said[0] if said else "",
+        expect=[e for e in expect if isinstance(e, dict)]
+        if isinstance(expect, list)
+        else [],
+        problem=problem,
     )
 
 
@@ -96,7 +165,8 @@ def format_listing(entries: list[RecipeEntry]) -> str:
     width = max((len(entry.name) for entry in entries), default=0)
     lines = []
     for entry in entries:
-        lines.append(f"{entry.name:<{width}}  {entry.headline}")
+        said = f"BROKEN: {entry.problem}" if entry.problem else entry.headline
+        lines.append(f"{entry.name:<{width}}  {said}".rstrip())
         lines += [f"{'':<{width}}    expects {_promise(e)}" for e in entry.expect]
     return "\n".join(lines)
 
@@ -113,36 +183,39 @@ def _promise(entry: dict[str, Any]) -> str:
 
 
 def copy_recipe(name_or_path: str | Path, destination: str | Path) -> Path:
-    """Copy a recipe to a file or into a folder, never over an existing file.
+    """Copy a recipe, or an option of a group, never over an existing file.
 
     Args:
-        name_or_path: the recipe.
+        name_or_path: the recipe, or `group/option`.
         destination: a new file, or an existing folder.
 
     Returns:
         The new file.
     """
-    source = find_recipe(name_or_path)
-    target = Path(destination)
+    source = find_option(name_or_path) or find_recipe(name_or_path)
+    text, target = read_text(source), Path(destination)
     if target.is_dir():
         target = target / source.name
     if target.suffix not in (".yaml", ".yml"):
         target = target.with_name(f"{target.name}.yaml")
-    if target.exists():
-        raise FlashdexError(f"{target}: exists already; choose another name")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(source, target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise FlashdexError(f"{target}: exists already; choose another name") from error
+    except (OSError, ValueError) as error:
+        raise FlashdexError(f"{target}: cannot be written ({error})") from error
     return target
 
 
 def task_of_run(run_dir: Path) -> str:
     """Return the task of a run directory; the default where none is stated."""
     try:
-        data = yaml.safe_load((run_dir / "recipe.yaml").read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
+        data = read_yaml(run_dir / "recipe.yaml")
+    except RecipeError:
         return DEFAULT_TASK  # the verb itself says what is wrong with the folder
-    task = data.get("task") if isinstance(data, dict) else None
-    return GYM_TASK if task == GYM_TASK else DEFAULT_TASK
+    return GYM_TASK if data.get("task") == GYM_TASK else DEFAULT_TASK
 
 
 def require_motions(run_dir: Path) -> None:

@@ -13,7 +13,7 @@ from flashdex.envs.config import GymConfig
 from flashdex.envs.mdp.term import KINDS as TERM_KINDS
 from flashdex.envs.mdp.term import default_mapping, registry, terms_of
 from flashdex.errors import FlashdexError, nearest
-from flashdex.hands.spec import known_hands
+from flashdex.hands import known_hands
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
 from flashdex.recipe.store import DEFAULT_TASK, GYM_TASK
@@ -249,7 +249,7 @@ def split_foreign(
     """
     kept = dict(data)
     task = data.get("task", DEFAULT_TASK)
-    if task not in KINDS:
+    if not isinstance(task, str) or task not in KINDS:
         problems.append(
             f"task: {task!r} is not a task.{nearest(str(task), KINDS)} "
             f"Allowed: {', '.join(KINDS)}."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fnmatch
 import hashlib
 import json
 import logging
@@ -19,7 +18,7 @@ from torchrl.envs.transforms import Transform
 from flashdex import keys
 from flashdex.algorithms import find_algorithm
 from flashdex.algorithms.base import Learner, TaskSpec
-from flashdex.datasets.source import SourceOptions
+from flashdex.datasets.source import SourceOptions, is_named
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.scene import Scene, build_scenes
@@ -55,7 +54,7 @@ def load_library(recipe: Recipe) -> MotionLibrary:
             "of a prepared library, or motions.source=procedural."
         )
     folder = Path("libraries") / library_name(recipe)
-    order = _order(recipe)
+    order = make_order(recipe)
     if (library := _load_current(folder)) is not None:
         try:
             if library.manifest.get("inputs") == hash_inputs(order):
@@ -79,17 +78,20 @@ def _load_current(folder: Path) -> MotionLibrary | None:
         return None
 
 
-def _order(recipe: Recipe) -> Order:
+def make_order(recipe: Recipe) -> Order:
+    """What a recipe that names a source has prepared: the motions it asks for."""
     motions = recipe.motions
     assert motions.source is not None
-    # made-up motions are made by number; of recorded ones, the selection is counted
-    counted = motions.source == "procedural" or motions.select is None
+    # made-up motions are made by number, and selected from those
+    made_up = motions.source == "procedural"
+    select = None if made_up or motions.select is None else tuple(motions.select)
     options = SourceOptions(
         path=None if motions.input is None else Path(motions.input),
         mano=None if motions.mano is None else Path(motions.mano),
         models=None if motions.models is None else Path(motions.models),
         seed=motions.seed,
-        limit=motions.count if counted else None,
+        select=select,
+        limit=motions.count,
     )
     settings = MotionSettings(
         hand=recipe.hand, control_hz=motions.control_hz, speed=motions.speed
@@ -100,8 +102,7 @@ def _order(recipe: Recipe) -> Order:
 def library_name(recipe: Recipe) -> str:
     """Folder name of an automatic library: readable, and unique by the recipe."""
     motions = dataclasses.asdict(recipe.motions)
-    for key in ("library", "select"):
-        motions.pop(key)
+    motions.pop("library")
     text = json.dumps({**motions, "hand": recipe.hand}, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return f"{recipe.motions.source}-{recipe.hand}-{digest}"
@@ -116,11 +117,9 @@ def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
     if recipe.motions.select is not None:
         chosen = []
         for pattern in recipe.motions.select:
-            rows = [
-                i
-                for i, name in enumerate(library.names)
-                if fnmatch.fnmatch(name, pattern)
-            ]
+            if recipe.motions.count is not None and len(chosen) >= recipe.motions.count:
+                break  # of the others none need be there
+            rows = [i for i, n in enumerate(library.names) if is_named(n, pattern)]
             if not rows:
                 raise LibraryError(
                     f"{library.path}: motions.select '{pattern}' matches none of "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import signal
 from collections.abc import Iterator
@@ -13,11 +12,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from flashdex.algorithms import find_algorithm
 from flashdex.errors import RunError
-from flashdex.recipe import RunRecipe
+from flashdex.recipe import RunRecipe, dump_recipe
+from flashdex.recipe.reader import parse_yaml
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.system.files import own_file
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
@@ -115,7 +113,10 @@ def stored_value(text: str, key: str) -> Any:
         >>> stored_value("algo: {v_max: 5.0}", "algo.v_max")
         5.0
     """
-    return OmegaConf.select(OmegaConf.create(text), key)
+    found: Any = parse_yaml(text, where="the recipe of a checkpoint")
+    for word in key.split("."):
+        found = found.get(word) if isinstance(found, dict) else None
+    return found
 
 
 def refuse_changes(text: str, recipe: RunRecipe) -> None:
@@ -124,7 +125,7 @@ def refuse_changes(text: str, recipe: RunRecipe) -> None:
     Raises:
         RunError: one message with every value that differs.
     """
-    present = OmegaConf.to_yaml(dataclasses.asdict(recipe))
+    present = dump_recipe(recipe)
     algorithm = find_algorithm(stored_value(text, "algo.kind"))
     changed = []
     for key in (*LABELS, *algorithm.immutable_keys):

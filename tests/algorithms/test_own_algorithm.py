@@ -26,9 +26,9 @@ class HillConfig(AlgoConfig):
     """Random search on one constant action."""
 
     kind: str = "hill"
-    spread: float = number(0.1, above=0)
+    spread: float = number(0.1, above=0, high=10)
     """Standard deviation of a change."""
-    patience: int = number(2, low=1)
+    patience: int = number(2, low=1, high=10_000)
     """Vector steps for which a change is tried."""
 
 
@@ -141,7 +141,7 @@ def test_its_keys_are_checked_like_all_others(recipe_file):
         compose(recipe_file, words)
     found = "\n".join(caught.value.problems)
     for expected in (
-        "algo.spread: -1.0 must be greater than 0",
+        "algo.spread: -1 must be greater than 0",
         "algo.patience: 1000 steps exceed the budget",
         "algo.spred: unknown key. Did you mean 'spread'?",
     ):

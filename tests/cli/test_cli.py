@@ -53,7 +53,7 @@ def test_debug_shows_the_traceback():
     ("argv", "expected"),
     [
         ([], "required"),
-        (["trian"], "invalid choice"),
+        (["trian"], "Did you mean 'train'?"),
         (["train"], "give a recipe"),
         (["train", "quickstart", "--lr", "3"], "key=value, without dashes"),
         (["ls", "something"], "unknown: something"),

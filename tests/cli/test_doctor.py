@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from flashdex.system.machine import Machine
 from flashdex.training.memory import plan as memory
 
 PAGE = Path(__file__).parents[2] / "docs" / "memory.md"
+PACKAGE = Path(__file__).parents[2] / "flashdex"
 GB = 10**9
 
 
@@ -82,3 +85,26 @@ def test_the_page_shows_what_is_printed(give):
     assert len(lines) == len(names)
     for line in [*lines, next(s for s in report.splitlines() if "GFLOP" in s)]:
         assert line in page
+
+
+def test_a_missing_package_is_an_answer(give, capsys, monkeypatch):
+    """Exit code 1, as the page says: something is missing, nothing is mistaken."""
+    give()
+    for name in ("mujoco_warp", "warp"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["doctor", "quickstart", "physics=warp"]) == 1
+    assert "pip install '.[warp]'" in capsys.readouterr().out
+
+
+def test_only_extras_that_code_uses_are_advertised():
+    project = tomllib.loads((PAGE.parents[1] / "pyproject.toml").read_text())["project"]
+    code = "\n".join(p.read_text() for p in PACKAGE.rglob("*.py"))
+    used = set(re.findall(r', extra="(\w+)"\)', code))
+    assert set(project["optional-dependencies"]) == used | {"dev"}
+
+
+def test_licence_and_notice_go_into_the_wheel():
+    project = tomllib.loads((PAGE.parents[1] / "pyproject.toml").read_text())["project"]
+    for name in ("LICENSE", "NOTICE"):
+        assert name in project["license-files"]
+        assert (PAGE.parents[1] / name).is_file()

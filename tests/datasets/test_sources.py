@@ -97,3 +97,46 @@ def test_codes_are_a_field_of_the_error():
     assert str(error) == "E_KEYS: file: lacks pose."
     plain = DemoError("too short")
     assert (plain.code, str(plain)) == (None, "too short")
+
+
+@pytest.fixture
+def shelf(monkeypatch):
+    """A source of five recordings, one of them with brackets in its name."""
+    monkeypatch.setattr(datasets, "REGISTERED", {})
+    names = ("cup_1", "cup_2", "pour[1]", "pour1", "bowl")
+    listed = [Recording(name=name, read=list) for name in names]
+    datasets.register(Source(name="shelf", list=lambda _: listed, about="", needs=()))
+    return "shelf"
+
+
+@pytest.mark.parametrize(
+    ("select", "limit", "expected"),
+    [
+        (None, None, ["cup_1", "cup_2", "pour[1]", "pour1", "bowl"]),
+        (None, 2, ["cup_1", "cup_2"]),
+        (("bowl", "cup_*"), None, ["bowl", "cup_1", "cup_2"]),
+        (("bowl", "cup_*"), 1, ["bowl"]),
+        (("cup_*", "cup_2"), 5, ["cup_1", "cup_2"]),
+        (("pour[1]",), None, ["pour[1]", "pour1"]),  # literally, and as a glob
+        (("cup_1_b",), 1, ["cup_1", "cup_2", "pour[1]", "pour1", "bowl"]),  # a piece
+    ],
+    ids=["all", "first", "chosen", "chosen_first", "once", "literal", "piece"],
+)
+def test_only_what_is_asked_for_is_prepared(shelf, select, limit, expected):
+    options = SourceOptions(select=select, limit=limit)
+    assert [r.name for r in list_recordings(shelf, options)] == expected
+
+
+def test_a_recipe_asks_for_its_selection_only(shelf):
+    """`train myodm_xhand motions.count=1` once prepared all 95 clips."""
+    from flashdex.recipe import Recipe
+    from flashdex.recipe.motions import MotionsConfig
+    from flashdex.training.build import library_name, make_order
+
+    def order(**motions):
+        config = MotionsConfig(source="myodm", select=["bowl", "cup_*"], **motions)
+        return Recipe(name="any", total_env_steps=1, motions=config)
+
+    options = make_order(order(count=1)).options
+    assert [r.name for r in list_recordings(shelf, options)] == ["bowl"]
+    assert library_name(order()) != library_name(order(count=1))

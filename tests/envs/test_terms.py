@@ -71,7 +71,7 @@ def test_a_registered_term_is_checked_and_stands_on_the_page(my_terms):
     with pytest.raises(RecipeError) as error:
         compose("quickstart", wrong)
     found = "\n".join(error.value.problems)
-    assert "env.rewards.slow_object.scale: 0.0 must be greater than 0" in found
+    assert "env.rewards.slow_object.scale: 0 must be greater than 0" in found
     assert "env.transforms.object_height.x: unknown argument" in found
     spec = importlib.util.spec_from_file_location("page", DOCS / "make_options.py")
     script = importlib.util.module_from_spec(spec)
@@ -117,7 +117,7 @@ def test_a_class_of_terms_keeps_and_forgets(make_env):
             stride: What a step adds.
         """
 
-        def __init__(self, context, *, stride: float = number(2.0, above=0)):
+        def __init__(self, context, *, stride: float = number(2.0, above=0, high=100)):
             self.total = torch.zeros(context.num_envs, 2)
             self.stride = stride
 

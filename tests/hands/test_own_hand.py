@@ -11,7 +11,8 @@ import pytest
 
 import flashdex.hands
 from flashdex.errors import RecipeError, UnknownHandError
-from flashdex.hands.spec import known_hands, load_hand
+from flashdex.hands import known_hands
+from flashdex.hands.spec import load_hand
 from flashdex.recipe import compose, validate
 from flashdex.system.mjcf import ModelError
 

@@ -16,8 +16,10 @@ from flashdex.errors import DemoError
 from flashdex.motions.align import align
 from flashdex.motions.checks.aligned import check_left_out
 from flashdex.motions.contact.roles import find_roles
+from flashdex.motions.pipeline import workers as pool
 from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
+from flashdex.motions.pipeline.stage import listening
 from flashdex.motions.pipeline.workers import Job, run_job, run_jobs
 from flashdex.motions.repair.repair import repair
 from flashdex.objects.asset import ObjectSettings
@@ -270,6 +272,24 @@ def test_objects_without_a_slot_are_chosen_by_touch_and_told():
     assert aligned.object_names[-1] == "box"
     codes = [f.code for f in check_left_out(aligned)]
     assert codes == ["W_OBJECTS"]
+
+
+def test_stages_inside_one_recording_are_told(settings, monkeypatch, caplog):
+    """A new mesh takes a minute: without a terminal each stage can be a line."""
+    monkeypatch.setattr(pool, "LINE_SECONDS", -1.0)
+    options = SourceOptions(path="pick_box_right", limit=1)
+    (listed,) = list_recordings("procedural", options)
+    heard = []
+    with listening(heard.append), caplog.at_level("INFO"):
+        run_jobs([Job(listed, settings)], workers=1)
+    name = listed.name
+    wanted = ["reading", "mesh of box", "contact", "joints of xhand"]
+    assert heard == [f"{name}: {stage}" for stage in wanted]
+    assert "prepared 0 of 1 recordings; pick_box_right: mesh of box" in caplog.text
+    assert "prepared 1 of 1 recordings; 1 kept" in caplog.text
+    heard.clear()
+    run_jobs([Job(listed, settings)], workers=1)
+    assert not heard  # nobody listens, and it comes from the cache
 
 
 def change_entries(file, change):

@@ -267,10 +267,12 @@ def leaves(data, path=()):
 
 def default_of(path):
     """Look a path up in the schema's defaults, options of named parts included."""
-    recipe = GymRecipe(name="", total_env_steps=10**9, gym=GymConfig(env_id="Any-v0"))
+    recipe = GymRecipe(
+        name="any", total_env_steps=10**9, gym=GymConfig(env_id="Any-v0")
+    )
     if path[0] != "gym":
         motions = MotionsConfig(source="procedural")
-        recipe = validate(Recipe(name="", total_env_steps=10**9, motions=motions))
+        recipe = validate(Recipe(name="any", total_env_steps=10**9, motions=motions))
     node = dataclasses.asdict(recipe)
     for key in path:
         node = node.get(key, None) if isinstance(node, dict) else None

@@ -138,3 +138,40 @@ def test_a_rollout_that_cannot_be_drawn_is_named(run_dir, backend):
     fault = draw_films([broken])
     assert fault.startswith("no pictures of broken: ")
     assert "not a readable rollout" in fault
+
+
+WALLED = """
+import sys, mujoco, numpy as np
+from flashdex.reports.render.scene import ScenePainter
+
+XML = '''<mujoco><worldbody><body name="thing" mocap="true">
+<geom type="sphere" size=".03" rgba="1 0 0 1"/></body>
+<body name="palm" mocap="true"><geom type="box" size=".005 .12 .1"/></body>
+</worldbody></mujoco>'''
+
+class Walled(ScenePainter):
+    def _place(self, frame):
+        turn = np.radians([135.0, 225.0, 45.0, 315.0][frame])
+        side = np.array([np.cos(turn), np.sin(turn), 0.0])
+        self._data.mocap_pos[:] = [0, 0, 0], -0.06 * side
+        self._data.mocap_quat[1] = [np.cos(turn / 2), 0, 0, np.sin(turn / 2)]
+    def _points(self, frame):
+        return self._data.mocap_pos.copy()
+    def _is_object(self):
+        return np.array([False, True, False])
+
+painter = Walled(mujoco.MjSpec.from_string(XML), size=(128, 96), middle=0)
+red = lambda p: int((p[..., 0] > p[..., 2] + 60.0).sum())
+print([[red(painter.draw(t)), red(painter.draw_still(t))] for t in range(4)])
+"""
+
+
+def test_a_still_is_taken_from_where_the_object_shows(backend):
+    """A palm stands before the object, each time on another side."""
+    env = {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PATH": ""}
+    words = [sys.executable, "-c", WALLED]
+    out = subprocess.run(words, env=env, capture_output=True, check=True)
+    counts = json.loads(out.stdout.splitlines()[-1])
+    assert min(fixed for fixed, _ in counts) == 0  # one side hides it at some time
+    assert min(still for _, still in counts) > 100
+    assert all(still >= fixed for fixed, still in counts)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from flashdex.recipe import LoggerConfig, Recipe
+from flashdex.errors import FlashdexError
+from flashdex.recipe import LoggerConfig, Recipe, compose
 from flashdex.system.jsonl import read_lines
-from flashdex.training.logging import Copy, MetricLog
+from flashdex.training.logging import Copy, MetricLog, check_writers
+from flashdex.training.run_dir import train
 
 RECORDS = [
     {"env_steps": 48, "hours": 0.01, "convert/cumulative": 0.0},
@@ -59,8 +61,6 @@ def test_wandb_offline_run_holds_the_records(tmp_path, monkeypatch):
 
 def test_wandb_is_named_when_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "wandb", None)
-    from flashdex.errors import FlashdexError
-
     recipe = Recipe(name="tiny", total_env_steps=100)
     recipe = replace(recipe, logger=LoggerConfig(kind=["wandb"]))
     with pytest.raises(FlashdexError, match="pip install wandb"):
@@ -148,3 +148,27 @@ def test_without_a_server_the_session_is_written_to_files(
     assert len(ids) == 2
     assert "W&B is not there (no route to host)" in caplog.text
     assert len(read_lines(tmp_path / "metrics.jsonl")) == 2 * len(RECORDS)
+
+
+def refuse(**_):
+    raise OSError("no route to host")
+
+
+@pytest.mark.parametrize(
+    ("login", "expected"),
+    [(lambda **_: False, "has no key"), (refuse, "no route to host")],
+    ids=["no_key", "no_network"],
+)
+def test_wandb_is_asked_before_anything_is_made(tmp_path, monkeypatch, login, expected):
+    import wandb
+
+    monkeypatch.setattr(wandb, "login", login)
+    monkeypatch.setattr(wandb, "setup", lambda **_: None)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    recipe = compose("quickstart", ["logger=wandb", f"run_dir={tmp_path / 'run'}"])
+    with pytest.raises(FlashdexError, match=expected) as caught:
+        train(recipe)
+    assert "logger.wandb_mode=offline" in str(caught.value)
+    assert not (tmp_path / "run").exists()
+    for change in (["logger.wandb_mode=offline"], ["logger.kind=[csv]"]):
+        check_writers(compose("quickstart", ["logger=wandb", *change]))  # asks nobody

@@ -22,7 +22,7 @@ from flashdex.envs.transforms.base import Block
 
 
 @reward("gentle", weight=0.05, gate="imitation")
-def gentle(step, *, scale: float = number(1.0, above=0)):
+def gentle(step, *, scale: float = number(1.0, above=0, high=1000)):
     """Slow joints.
 
     Args:
@@ -32,7 +32,7 @@ def gentle(step, *, scale: float = number(1.0, above=0)):
 
 
 @termination()
-def too_long(step, *, steps: int = number(10, low=1)):
+def too_long(step, *, steps: int = number(10, low=1, high=10_000)):
     """Long episodes.
 
     Args:

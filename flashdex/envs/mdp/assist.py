@@ -240,37 +240,37 @@ class AssistConfig:
 
     enabled: bool = False
     """Off by default; the released code has it on for 63 % of training."""
-    kp: float = number(80.0, low=0)
+    kp: float = number(80.0, low=0, high=1e6)
     """Stiffness at the start, N/m."""
-    kv: float = number(5.0, low=0)
+    kv: float = number(5.0, low=0, high=1e6)
     """Damping at the start, N s/m."""
-    torque_ratio: float = number(96.0, low=0)
+    torque_ratio: float = number(96.0, low=0, high=1e6)
     """Angular over linear stiffness; its square root for the damping."""
-    force_limit: float = number(50.0, low=0)
+    force_limit: float = number(50.0, low=0, high=1e6)
     """Clamp of each force component, N."""
-    torque_limit: float = number(50.0, low=0)
+    torque_limit: float = number(50.0, low=0, high=1e6)
     """Clamp of each torque component, N m."""
-    epoch_steps: int = number(32, low=1)
+    epoch_steps: int = number(32, low=1, high=10**6)
     """Control steps an epoch."""
-    window_epochs: int = number(30, low=1)
+    window_epochs: int = number(30, low=1, high=10**6)
     """Epochs over which the gates are averaged; cleared at each decay."""
-    wait_epochs: int = number(100, low=0)
+    wait_epochs: int = number(100, low=0, high=10**9)
     """Epochs before the first decay."""
-    cooldown_epochs: int = number(40, low=0)
+    cooldown_epochs: int = number(40, low=0, high=10**9)
     """Epochs between two decays; shorter frees the object sooner."""
     decay: float = number(0.9, above=0, high=1)
     """Factor of the upper gain at each decay."""
     lower_ratio: float = number(0.8, low=0, high=1)
     """Lower end of the per-world draw over the upper one, after a decay."""
-    zero_below: float = number(0.05, low=0)
+    zero_below: float = number(0.05, low=0, high=1e6)
     """All gains become zero once the upper kp is below this."""
-    lower_zero_below: float = number(0.1, low=0)
+    lower_zero_below: float = number(0.1, low=0, high=1e6)
     """The lower end becomes zero once it is below this."""
     task_gate: float = number(0.6, low=0, high=1)
     """Weighted object term, summed over hands, that a decay demands."""
-    imitation_gate: float = number(0.01, low=0)
+    imitation_gate: float = number(0.01, low=0, high=1e6)
     """Imitation reward that a decay demands."""
-    bc_gate: float = number(0.01, low=0)
+    bc_gate: float = number(0.01, low=0, high=1e6)
     """Behaviour-cloning reward that a decay demands."""
     completion_gate: float = number(0.65, low=0, high=1)
     """Share of episodes without failure that a decay demands."""
@@ -279,7 +279,7 @@ class AssistConfig:
     released code has the rule in an order that never acts."""
     dial_back_completion: float = number(0.5, low=0, high=1)
     """Completion below which a level is returned."""
-    dial_back_epochs: int = number(500, low=0)
+    dial_back_epochs: int = number(500, low=0, high=10**9)
     """Epochs since the last decay before a level may be returned."""
     dial_back_factor: float = number(0.98, above=0, high=1)
     """Factor on the returned level."""

@@ -82,13 +82,13 @@ def reset_state(
 class ResetNoise:
     """Standard deviations of the start state around the reference."""
 
-    wrist_pos: float = number(0.001, low=0)
+    wrist_pos: float = number(0.001, low=0, high=1)
     """Wrist position, m."""
-    wrist_rot_deg: float = number(1.0, low=0)
+    wrist_rot_deg: float = number(1.0, low=0, high=180)
     """Wrist orientation, degrees."""
-    finger_range: float = number(0.0125, low=0)
+    finger_range: float = number(0.0125, low=0, high=1)
     """Finger joints, share of the joint range."""
-    wrist_vel: float = number(0.001, low=0)
+    wrist_vel: float = number(0.001, low=0, high=100)
     """Added to the wrist velocity, m/s and rad/s."""
-    finger_vel: float = number(0.01, low=0)
+    finger_vel: float = number(0.01, low=0, high=100)
     """Replaces the finger velocity, rad/s."""

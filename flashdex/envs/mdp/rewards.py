@@ -73,8 +73,8 @@ class ObjectPoints:
         self,
         context: TermContext,
         *,
-        sigma: float = number(0.1, above=0),
-        rho: float = number(0.058, low=0),
+        sigma: float = number(0.1, above=0, high=1e6),
+        rho: float = number(0.058, low=0, high=10),
         top_k: int = number(3, low=1, high=128),
     ) -> None:
         bank = context.bank
@@ -108,8 +108,8 @@ def object_pose_exp(
     ref_pos: Tensor,
     ref_quat: Tensor,
     *,
-    beta_pos: float = number(10.0, above=0),
-    beta_rot: float = number(1.0, above=0),
+    beta_pos: float = number(10.0, above=0, high=1e6),
+    beta_rot: float = number(1.0, above=0, high=1e6),
 ) -> Tensor:
     """DexMachina's object term exp(-b_p d) exp(-b_r angle), off by default.
 
@@ -135,7 +135,7 @@ def _tip_distances(step: Step) -> tuple[Tensor, Tensor]:
 
 @reward("fingertip_distance", weight=0.3, inputs=_tip_distances, needs_object=True)
 def fingertip_distance_exp(
-    dist: Tensor, ref_dist: Tensor, *, sigma: float = number(0.01, above=0)
+    dist: Tensor, ref_dist: Tensor, *, sigma: float = number(0.01, above=0, high=1e6)
 ) -> Tensor:
     """Eq. (8): mean over tips of exp(-max(0, d - d_ref) / sigma).
 
@@ -154,7 +154,7 @@ def _both(name: str) -> Callable[[Step], tuple[Tensor, Tensor]]:
 
 @reward("wrist_pos", weight=0.15, inputs=_both("wrist_pos"), gate="imitation")
 def wrist_pos_error_exp(
-    pos: Tensor, ref_pos: Tensor, *, scale: float = number(10.0, above=0)
+    pos: Tensor, ref_pos: Tensor, *, scale: float = number(10.0, above=0, high=1e6)
 ) -> Tensor:
     """exp(-scale d), d to the human wrist, m.
 
@@ -168,7 +168,7 @@ def wrist_pos_error_exp(
 
 @reward("wrist_rot", weight=0.15, inputs=_both("wrist_quat"), gate="imitation")
 def wrist_rot_error_exp(
-    quat: Tensor, ref_quat: Tensor, *, scale: float = number(3.0, above=0)
+    quat: Tensor, ref_quat: Tensor, *, scale: float = number(3.0, above=0, high=1e6)
 ) -> Tensor:
     """exp(-scale angle) to the wanted wrist orientation, rad.
 
@@ -182,7 +182,7 @@ def wrist_rot_error_exp(
 
 @reward("fingertip_pos", weight=0.3, inputs=_both("tip_pos"), gate="imitation")
 def fingertip_pos_error_exp(
-    pos: Tensor, ref_pos: Tensor, *, scale: float = number(20.0, above=0)
+    pos: Tensor, ref_pos: Tensor, *, scale: float = number(20.0, above=0, high=1e6)
 ) -> Tensor:
     """Mean over tips of exp(-scale d) to the human tips, m.
 
@@ -205,7 +205,7 @@ def behaviour_cloning_exp(
     ref_joint_pos: Tensor,
     joint_range: Tensor,
     *,
-    scale: float = number(500.0, above=0),
+    scale: float = number(500.0, above=0, high=1e6),
 ) -> Tensor:
     """Mean over joints of exp(-scale (target - ref)^2 / (2 range)).
 
@@ -222,7 +222,11 @@ def behaviour_cloning_exp(
     return torch.exp(-scale * error).mean(-1)
 
 
-@reward("action_l2", weight=number(-0.01, high=0), inputs=lambda step: (step.action,))
+@reward(
+    "action_l2",
+    weight=number(-0.01, low=-1e6, high=0),
+    inputs=lambda step: (step.action,),
+)
 def action_l2(action: Tensor) -> Tensor:
     """Mean square of the raw action.
 
@@ -235,7 +239,7 @@ def action_l2(action: Tensor) -> Tensor:
 
 @reward(
     "failure",
-    weight=number(-100.0, high=0),
+    weight=number(-100.0, low=-1e6, high=0),
     inputs=lambda step: (step.failed,),
     on_failure=True,
 )

@@ -35,6 +35,7 @@ _LAYOUT = (
     *("surface_distance", "contact", "future_window"),
 )
 _TARGET = "_target_"
+_LARGE = 1_000_000  # range of a number that declares none, either side
 _ALLOWED = {"flashdex", "torchrl"}
 _TERMS: dict[Kind, dict[str, Term]] = {kind: {} for kind in KINDS}
 
@@ -133,11 +134,12 @@ def _options_of(make: Callable[..., Any], weight: float | None) -> type:
     given = inspect.signature(call).parameters.values()
     fields = []
     for p in [p for p in given if p.kind == p.KEYWORD_ONLY]:
-        fields.append((p.name, p.annotation, _field(p.default, texts.get(p.name, ""))))
+        field = _field(p.default, texts.get(p.name, ""), p.annotation)
+        fields.append((p.name, p.annotation, field))
         if isinstance(p.default, Field):
             call.__kwdefaults__[p.name] = p.default.default
     if weight is not None:
-        fields.insert(0, ("weight", float, _field(weight, texts["weight"])))
+        fields.insert(0, ("weight", float, _field(weight, texts["weight"], float)))
     return dataclasses.make_dataclass(
         f"{make.__name__}_options",
         fields,
@@ -147,7 +149,9 @@ def _options_of(make: Callable[..., Any], weight: float | None) -> type:
     )
 
 
-def _field(default: Any, text: str) -> Any:
+def _field(default: Any, text: str, kind: Any) -> Any:
+    if not isinstance(default, Field) and re.search(r"\b(int|float)\b", str(kind)):
+        default = number(default, low=-_LARGE, high=_LARGE)
     ranges = dict(default.metadata) if isinstance(default, Field) else {}
     value = default.default if isinstance(default, Field) else default
     value = MISSING if value is inspect.Parameter.empty else value

@@ -16,7 +16,7 @@ from flashdex.envs.mdp.term import number, termination
 
 @termination(inputs=lambda step: (step.own_pos, step.ref["own_pos"]), needs_object=True)
 def object_dropped(
-    pos: Tensor, ref_pos: Tensor, *, distance: float = number(0.1, above=0)
+    pos: Tensor, ref_pos: Tensor, *, distance: float = number(0.1, above=0, high=1e6)
 ) -> Tensor:
     """Object below its reference height; charges the hand of that object.
 
@@ -66,7 +66,7 @@ class EarlyReset:
         context: TermContext,
         *,
         threshold: float = number(0.6, low=0, high=1),
-        window: int = number(5, low=1),
+        window: int = number(5, low=1, high=10**6),
     ) -> None:
         self.threshold, self.window = threshold, window
         device = context.bank.table.device
@@ -95,8 +95,8 @@ def fingertip_off(
     ref_pos: Tensor,
     steps: Tensor,
     *,
-    distance: float = number(0.2, above=0),
-    grace: int = number(15, low=0),
+    distance: float = number(0.2, above=0, high=1e6),
+    grace: int = number(15, low=0, high=10**6),
 ) -> Tensor:
     """A fingertip far from its human tip; charges that hand.
 
@@ -124,10 +124,10 @@ def sanity(
     object_vel: Tensor,
     numerics: Tensor,
     *,
-    max_link_speed: float = number(100.0, above=0),
-    max_joint_speed: float = number(200.0, above=0),
-    max_object_speed: float = number(100.0, above=0),
-    max_object_spin: float = number(200.0, above=0),
+    max_link_speed: float = number(100.0, above=0, high=1e6),
+    max_joint_speed: float = number(200.0, above=0, high=1e6),
+    max_object_speed: float = number(100.0, above=0, high=1e6),
+    max_object_spin: float = number(200.0, above=0, high=1e6),
 ) -> Tensor:
     """Speeds no healthy simulation reaches, or NaN; charges both hands.
 

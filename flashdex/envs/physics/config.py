@@ -15,34 +15,34 @@ class PhysicsConfig:
     engine: Literal["cpu", "warp", "brax"] = "cpu"
     """cpu = MuJoCo C on all cores; warp = all worlds on one NVIDIA GPU; brax = MJX on
     JAX, for collections whose motions all use the same objects."""
-    decimation: int = number(4, low=1)
+    decimation: int = number(4, low=1, high=1000)
     """Physics substeps a control step; fewer is faster and less stable."""
-    timestep: float = number(1 / 240, above=0)
+    timestep: float = number(1 / 240, low=1e-5, high=0.1)
     """Physics step, s; timestep x decimation must be one control step."""
     gains: Literal["vendor", "paper"] = "vendor"
     """Servo gains; vendor = what the real motors can follow (1.1 and 0.4 N m on
     XHand), paper = 20/1.5 with 100 N m, slower and far stronger."""
     gravcomp: float = number(1.0, low=0, high=1)
     """Share of the hand's weight that is compensated; 0 is the released code."""
-    friction: float = number(1.0, low=0)
+    friction: float = number(1.0, low=0, high=100)
     """Sliding friction of hand geoms."""
-    object_friction: float = number(2.0, low=0)
+    object_friction: float = number(2.0, low=0, high=100)
     """Sliding friction of object geoms; the larger of a pair counts."""
-    support_friction: float = number(1.0, low=0)
+    support_friction: float = number(1.0, low=0, high=100)
     """Sliding friction of supports; the larger of a pair counts."""
     condim: int = number(4, low=3, high=6)
     """Contact dimensions of objects: 3 = sliding, 4 adds torsion at the fingertip."""
-    impratio: float = number(10.0, above=0)
+    impratio: float = number(10.0, above=0, high=1e4)
     """Friction over normal constraint stiffness; larger slips less."""
     support_disks: bool = True
     """Rebuild tables and shelves as discs; off, objects have no support at all."""
     hand_support_contact: bool = True
     """Hands touch supports; off, they pass through tables as in a mocap overlay."""
-    iterations: int = number(20, low=1)
+    iterations: int = number(20, low=1, high=10_000)
     """Solver iterations; certificates use more."""
-    ls_iterations: int = number(50, low=1)
+    ls_iterations: int = number(50, low=1, high=10_000)
     """Line-search iterations."""
-    num_threads: int = number(0, low=0)
+    num_threads: int = number(0, low=0, high=256)
     """Threads of the cpu engine; 0 = all cores."""
     nconmax: int | None = number(None, low=1, high=10_000)
     """Contacts a world, warp only; null = four for each geom that moves. All worlds

@@ -37,6 +37,7 @@ from flashdex.motions.findings import (
 )
 from flashdex.motions.frames import make_record
 from flashdex.motions.library_writer import MotionRecord
+from flashdex.motions.pipeline.stage import tell
 from flashdex.motions.repair.objects import settle_objects
 from flashdex.motions.repair.repair import repair
 from flashdex.motions.repair.segment import segment
@@ -97,6 +98,7 @@ def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Pr
     """All motions of a listed recording, rejected ones too."""
 
     def read_all() -> list[Prepared]:
+        tell(recording.name, "reading")
         demos = recording.read()
         return [item for demo in demos for item in prepare_demo(demo, settings)]
 
@@ -180,16 +182,20 @@ def _prepare(
     if status_of(findings) == "rejected":
         return None
     motion = find_roles(align(demo, control_hz=settings.control_hz))
-    assets = [
-        make_object(m, settings=settings.objects, cache_dir=settings.cache_dir, name=n)
-        for m, n in zip(motion.meshes, motion.object_names, strict=True)
-    ]
+    assets = []
+    for m, n in zip(motion.meshes, motion.object_names, strict=True):
+        tell(demo.name, f"mesh of {n}")
+        cache = settings.cache_dir
+        asset = make_object(m, settings=settings.objects, cache_dir=cache, name=n)
+        assets.append(asset)
+    tell(demo.name, "contact")
     found, figures = check_aligned(motion, assets, make_slot_grid(assets, solid=False))
     findings += found
     row |= figures
     if status_of(findings) == "rejected":
         return None
     specs = load_hand(settings.hand)
+    tell(demo.name, f"joints of {settings.hand}")
     choice, targets = retarget(
         motion, assets, specs, weights=settings.weights, attempts=settings.attempts
     )

@@ -32,6 +32,7 @@ from flashdex.motions.pipeline.motion import (
     prepare_recording,
     rejected,
 )
+from flashdex.motions.pipeline.stage import listening, tell
 from flashdex.objects.mesh_files import MESH_SUFFIXES
 
 _LOG = logging.getLogger(__name__)
@@ -171,6 +172,7 @@ def _run_pool(
                 while waiting and len(running) < workers:
                     place, job = waiting.pop()
                     running[pool.submit(run_job, job)] = place
+                    tell(job.recording.name, "begun")
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     outcome = future.result()
                     yield running.pop(future), outcome
@@ -201,19 +203,37 @@ def _show(
     stream: Iterator[tuple[int, Outcome]], total: int, progress: bool | None
 ) -> Iterator[tuple[int, Outcome]]:
     hidden = None if progress is None else not progress
-    counts: Counter[str] = Counter()
-    last = time.monotonic()
     with tqdm(total=total, disable=hidden, unit="recording") as bar:
-        for done, item in enumerate(stream, start=1):
-            counts.update(row["status"] for row in item[1].rows)
-            told = ", ".join(f"{n} {status}" for status, n in sorted(counts.items()))
-            bar.set_postfix_str(told, refresh=False)
-            bar.update()
-            due = time.monotonic() - last > LINE_SECONDS
-            if bar.disable and progress is None and due:
-                last = time.monotonic()
-                _LOG.info("prepared %d of %d recordings: %s", done, total, told)
-            yield item
+        shown = _Progress(bar, lines=bar.disable and progress is None)
+        with listening(shown.hear):
+            for item in stream:
+                shown.count(item[1])
+                yield item
+
+
+class _Progress:
+    """What a bar says, or a line now and then: counts, and what is being done."""
+
+    def __init__(self, bar: tqdm, *, lines: bool) -> None:
+        self._bar, self._lines, self._last = bar, lines, time.monotonic()
+        self._done, self._counts = 0, Counter[str]()
+
+    def count(self, outcome: Outcome) -> None:
+        """One more recording is done."""
+        self._done += 1
+        self._counts.update(row["status"] for row in outcome.rows)
+        self._bar.update()
+        self.hear("")
+
+    def hear(self, stage: str) -> None:
+        """A stage of a recording begins."""
+        told = ", ".join(f"{n} {status}" for status, n in sorted(self._counts.items()))
+        note = "; ".join(filter(None, (told, stage)))
+        self._bar.set_postfix_str(note, refresh=bool(stage))
+        if self._lines and time.monotonic() - self._last > LINE_SECONDS:
+            self._last = time.monotonic()
+            text = "prepared %d of %d recordings; %s"
+            _LOG.info(text, self._done, self._bar.total, note)
 
 
 def _run_on_ray(jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from flashdex.reports.render.films import Film
-from flashdex.reports.render.scene import ScenePainter, draw_each, update_poses
+from flashdex.reports.render.scene import ScenePainter, View, draw_each, update_poses
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import open_atomic
 from flashdex.system.mjcf import check_mjcf
@@ -32,7 +32,7 @@ class Painter(ScenePainter):
     def __init__(self, rollout: Rollout) -> None:
         self.rollout = rollout
         self._moving = _moving_points(rollout)
-        self._cameras: dict[float, mujoco.MjvCamera] = {}
+        self._cameras: dict[View, mujoco.MjvCamera] = {}
         check_mjcf(rollout.model_xml, where=rollout.motion)
         spec = mujoco.MjSpec.from_string(rollout.model_xml)
         super().__init__(spec, size=(WIDTH, HEIGHT), middle=rollout.num_frames // 2)
@@ -41,11 +41,11 @@ class Painter(ScenePainter):
     def _points(self, frame: int) -> np.ndarray:
         return self._moving
 
-    def _camera(self, azimuth: float, frame: int) -> mujoco.MjvCamera:
+    def _camera(self, view: View, frame: int) -> mujoco.MjvCamera:
         """One for the whole film: it sees all that ever moves, and stands still."""
-        if azimuth not in self._cameras:
-            self._cameras[azimuth] = super()._camera(azimuth, frame)
-        return self._cameras[azimuth]
+        if view not in self._cameras:
+            self._cameras[view] = super()._camera(view, frame)
+        return self._cameras[view]
 
     def _is_object(self) -> np.ndarray:
         owners = self.model.jnt_bodyid[self.model.jnt_type == 0]
@@ -105,7 +105,7 @@ def write_film(rollout: Rollout, film: Film) -> None:
     painter = Painter(rollout)
     try:
         spread = np.linspace(0, last, NUM_STILLS).round().astype(int).tolist()
-        stills = [Image.fromarray(painter.draw(t)) for t in spread]
+        stills = [Image.fromarray(painter.draw_still(t)) for t in spread]
         frames = (painter.draw(t) for t in range(0, rollout.num_frames, stride))
         _write_mp4(frames, half, fps=rollout.fps / stride)
         os.replace(half, film.video)  # takes the place of a link, follows none

@@ -166,7 +166,7 @@ def write_strip(library: MotionLibrary, row: int, path: Path) -> None:
     """Draw the four stills of a motion side by side into a JPEG."""
     painter = StillPainter(library, row)
     try:
-        stills = [painter.draw(t) for t in still_frames(library, row).values()]
+        stills = [painter.draw_still(t) for t in still_frames(library, row).values()]
     finally:
         painter.close()
     strip = Image.fromarray(np.concatenate(stills, axis=1))

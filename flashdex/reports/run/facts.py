@@ -8,11 +8,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from flashdex.errors import RunError, UnknownNameError
+from flashdex.errors import RecipeError, RunError, UnknownNameError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria_table import Term, make_criteria, resolve_criterion
+from flashdex.recipe.reader import parse_yaml
 from flashdex.system.files import own_files
 from flashdex.system.jsonl import Schema, read_lines, read_object
 from flashdex.system.run_files import (
@@ -82,17 +81,16 @@ def load_run(run_dir: str | Path) -> RunData:
         RunError: this is no run directory, or a file in it is broken.
     """
     path = Path(run_dir)
-    recipe = path / RECIPE
-    read_recipe(path)  # refuses what is none, or was changed
+    text = read_recipe(path)  # refuses what is none, or was changed
     check_run(path)
     check_sessions(path)
     try:
-        composed = yaml.safe_load(recipe.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise RunError(f"{recipe}: not YAML ({error}). Restore the file.") from error
+        composed = parse_yaml(text, where=str(path / RECIPE))
+    except RecipeError as error:
+        raise RunError(f"{error}\nRestore the file.") from error
     return RunData(
         path=path,
-        recipe=composed if isinstance(composed, dict) else {},
+        recipe=composed,
         versions=read_object(path, VERSIONS),
         metrics=_drop_repeated(read_metrics(path)),
         attempts=read_lines(path / CONVERSIONS, ATTEMPT),

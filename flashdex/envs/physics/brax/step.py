@@ -9,6 +9,7 @@ import os
 import platform
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,8 @@ from torch import Tensor
 
 from flashdex.envs.physics.brax.model import BraxModel
 from flashdex.envs.physics.brax.wrench import WrenchInputs, object_wrench
+from flashdex.errors import FlashdexError
+from flashdex.objects.asset import default_cache_dir
 
 MAX_VALUE = 1e10  # MuJoCo's own bound of a usable number
 
@@ -231,10 +234,14 @@ def set_up() -> torch.device:
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        # Programs are for the processor that compiled them; homes can be shared.
-        folder = home / "flashdex" / "jax" / platform.node()
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+        with suppress(
+            FlashdexError, RuntimeError
+        ):  # without a home they are compiled anew
+            home = os.environ.get("XDG_CACHE_HOME")
+            root = Path(home) / "flashdex" if home else default_cache_dir()
+            # Programs are for the processor that compiled them; homes can be shared.
+            folder = root / "jax" / platform.node()
+            jax.config.update("jax_compilation_cache_dir", str(folder))
     device = _target()
     jax.config.update("jax_default_device", device)
     if device.platform == "gpu":

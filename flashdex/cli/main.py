@@ -181,6 +181,9 @@ def _add_run_verbs(
     )
     verb.add_argument("--json", action="store_true", help="print JSON")
 
+    verb = add("verify", _verify, "check every hash of runs and motion libraries")
+    verb.add_argument("paths", type=path, nargs="+", metavar="RUN|LIBRARY")
+
     verb = add("report", _report, "write report.html of a run again")
     verb.add_argument("run_dir", type=path, metavar="RUN")
 
@@ -310,6 +313,18 @@ def _replay(args: argparse.Namespace) -> int:
     for line in finding_lines(verified.findings, why):
         say(line)
     return 0 if verified.holds else 1
+
+
+def _verify(args: argparse.Namespace) -> int:
+    with loading():
+        from flashdex.reports.run.terminal import verification_lines
+        from flashdex.training.loaded import verify
+
+    found = [verify(path) for path in args.paths]
+    for one in found:
+        lines = verification_lines(one.path, one.files, one.findings, one.why)
+        say("\n".join(lines))
+    return 0 if all(one.holds for one in found) else 1
 
 
 def _score(args: argparse.Namespace) -> int:

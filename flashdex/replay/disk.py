@@ -85,6 +85,35 @@ def _read(run_dir: Path, stem: str) -> tuple[dict[str, Any], list[Segment]]:
     return manifest, [Segment.parse(entry) for entry in segments]
 
 
+def _read_rows(run_dir: Path, segment: Segment) -> TensorDict:
+    """Rows of a file.
+
+    Raises:
+        RunError, ValueError: it is a link, damaged, or holds what is not finite.
+    """
+    try:
+        content = read_tensors(run_dir, REPLAY, segment.file)
+    except ValueError as error:
+        raise ValueError(f"{segment.file}: {error}") from error
+    if isinstance(content, dict) and content.get("sealed") is True:
+        content = content.get("rows")  # bare in earlier versions
+    if not isinstance(content, dict):
+        raise ValueError(f"{segment.file}: it holds no rows")
+    if bad := first_non_finite(content):
+        raise ValueError(f"{segment.file}: its '{bad}' is not finite")
+    return TensorDict(content, batch_size=[segment.rows])
+
+
+def check_rows(run_dir: Path, stem: str) -> int:
+    """Read the replay rows of a checkpoint, file by file; returns how many there are.
+
+    Raises:
+        RunError, ValueError: the manifest or a file is missing or damaged.
+    """
+    _, segments = _read(run_dir, stem)
+    return sum(len(_read_rows(run_dir, segment)) for segment in segments)
+
+
 class ReplayLog:
     """Stores and restores a one-dimensional ring buffer beside the checkpoints.
 
@@ -190,7 +219,7 @@ class ReplayLog:
         writer, storage = self.buffer.writer, cast(Any, self.buffer.storage)
         writer.load_state_dict({"_cursor": first % self.capacity if same else 0})
         for segment in segments:
-            rows = self._rows(segment)
+            rows = _read_rows(self.run_dir, segment)
             rows = rows[max(0, oldest - segment.first) :]
             if len(rows):
                 self.buffer.extend(rows.to(storage.device))
@@ -201,24 +230,6 @@ class ReplayLog:
         # A ring of another size numbers its rows anew, so its segments are new, too.
         self._segments = segments if same else []
         self._written = written if same else len(self.buffer)
-
-    def _rows(self, segment: Segment) -> TensorDict:
-        """Rows of a file.
-
-        Raises:
-            RunError, ValueError: it is a link, damaged, or holds what is not finite.
-        """
-        try:
-            content = read_tensors(self.run_dir, REPLAY, segment.file)
-        except ValueError as error:
-            raise ValueError(f"{segment.file}: {error}") from error
-        if isinstance(content, dict) and content.get("sealed") is True:
-            content = content.get("rows")  # bare in earlier versions
-        if not isinstance(content, dict):
-            raise ValueError(f"{segment.file}: it holds no rows")
-        if bad := first_non_finite(content):
-            raise ValueError(f"{segment.file}: its '{bad}' is not finite")
-        return TensorDict(content, batch_size=[segment.rows])
 
     def prune(self, stems: set[str]) -> None:
         """Delete what no remaining checkpoint needs; files of its own only.

@@ -73,7 +73,7 @@ def save_checkpoint(
         content = {"format": FORMAT, "sealed": True, **state}
         write_tensors(content, run_dir, FOLDER, path.name)
     finally:
-        for old in _newest_first(run_dir)[keep:]:
+        for old in checkpoint_files(run_dir)[keep:]:
             remove_own(run_dir, FOLDER, old.name)
         if replay is not None:
             replay.prune(checkpoint_names(run_dir))
@@ -89,7 +89,7 @@ def load_checkpoint(
         RunError: there is none, none can be read, another version wrote it, or a key
             is missing.
     """
-    found = _newest_first(run_dir)
+    found = checkpoint_files(run_dir)
     if not found:
         raise RunError(
             f"{run_dir}: no checkpoint in '{FOLDER}/'. A run writes one every "
@@ -98,7 +98,7 @@ def load_checkpoint(
     faults = []
     for path in found:
         try:
-            state = _read(run_dir, path.name)
+            state = read_checkpoint(run_dir, path.name)
         except ValueError as error:
             faults.append(f"{path.name}: {error}")
             _LOG.warning("%s cannot be used (%s), trying the one before", path, error)
@@ -111,7 +111,7 @@ def load_checkpoint(
     )
 
 
-def _read(run_dir: Path, name: str) -> Any:
+def read_checkpoint(run_dir: Path, name: str) -> Any:
     """What a checkpoint holds; the learner in it is finite.
 
     Raises:
@@ -158,17 +158,17 @@ def checkpoint_name(env_steps: int) -> str:
 
 def checkpoint_names(run_dir: Path) -> set[str]:
     """Stems of all checkpoints of a run."""
-    return {path.stem for path in _newest_first(run_dir)}
+    return {path.stem for path in checkpoint_files(run_dir)}
 
 
 def has_checkpoint(run_dir: Path) -> bool:
     """Whether the run wrote any checkpoint, readable or not."""
-    return bool(_newest_first(run_dir))
+    return bool(checkpoint_files(run_dir))
 
 
 def newest_checkpoint(run_dir: Path) -> str:
     """Name of the newest checkpoint for messages, ``none`` without one."""
-    found = _newest_first(run_dir)
+    found = checkpoint_files(run_dir)
     return f"{FOLDER}/{found[0].name}" if found else "none"
 
 
@@ -178,12 +178,13 @@ def set_aside_newer(run_dir: Path, env_steps: int) -> None:
     Only unreadable ones do. Under their name they would be tried first at every resume
     and rotate good ones out.
     """
-    for path in _newest_first(run_dir):
+    for path in checkpoint_files(run_dir):
         if int(path.stem) > env_steps:
             os.replace(path, own_file(run_dir, FOLDER, f"{path.stem}.unreadable"))
 
 
-def _newest_first(run_dir: Path) -> list[Path]:
+def checkpoint_files(run_dir: Path) -> list[Path]:
+    """All checkpoints of a run, the newest first."""
     found = own_files(run_dir, FOLDER, "[0-9]*.pt")
     names = [p for p in found if FOLDERS[FOLDER].fullmatch(p.name)]
     return sorted(names, reverse=True)

@@ -1,9 +1,10 @@
-"""A run opened for reading, and its policy as a TorchRL module."""
+"""A run opened for reading, its files verified, its policy as a TorchRL module."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,40 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from flashdex import keys
 from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
+from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import MANIFEST
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
+from flashdex.replay.disk import check_rows
+from flashdex.rollouts.findings import Finding
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger, rollout_name
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
+from flashdex.rollouts.verify import Verified, verify_run
 from flashdex.system.files import own_file
-from flashdex.system.run_files import read_metrics
+from flashdex.system.jsonl import read_object
+from flashdex.system.run_files import (
+    BASELINES,
+    CHECKPOINTS,
+    DUMP,
+    EVALUATION,
+    METRICS,
+    MOTIONS,
+    RECIPE,
+    REPLAY,
+    SESSIONS,
+    VERSIONS,
+    check_run,
+    check_sessions,
+    read_metrics,
+    read_recipe,
+)
 from flashdex.training.build import RunBuilder
+from flashdex.training.checkpoint import (
+    check_format,
+    checkpoint_files,
+    read_checkpoint,
+)
+from flashdex.training.guard import read_dump
 from flashdex.training.memory.stand_in import find_library
 from flashdex.training.run_dir import load_learner, load_run_recipe
 
@@ -42,6 +70,112 @@ def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
     except FlashdexError as error:
         return None, str(error)
     return Truth(recipe, builder.library, builder.hands, builder.bank), ""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was read in a run or a library, and what was found.
+
+    Attributes:
+        path: the folder.
+        files: that were read whole and are as flashdex wrote them.
+        findings: what differs, and what could not be checked.
+        why: why there was no library to check rollouts against, or empty.
+    """
+
+    path: Path
+    files: list[str]
+    findings: list[Finding]
+    why: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Nothing differs."""
+        return not any(finding.is_fault for finding in self.findings)
+
+
+def verify(path: str | Path) -> Verification:
+    """Check every hash of a run or a library, and all that can be computed again.
+
+    Nothing is trusted that was checked before, and nothing is changed.
+
+    Raises:
+        RunError: the folder is neither.
+    """
+    path = Path(path)
+    if (path / MANIFEST).exists():
+        return _verify_library(path)
+    if not (path / RECIPE).exists():
+        raise RunError(
+            f"{path}: neither a run (no {RECIPE}) nor a motion library (no {MANIFEST})."
+        )
+    files, findings = read_all_files(path)
+    truth, why = open_truth(path)
+    try:
+        verified = verify_run(path, truth)
+    except RunError as error:
+        if (path / CONVERSIONS).exists():
+            findings.append(Finding(CONVERSIONS, "rollouts", str(error), False))
+        verified = Verified([], [])
+    for one in verified.rollouts:
+        if one.holds:
+            files.append(f"{rollout_name(one.motion)}, {one.found}")
+        elif not one.faults:
+            text = f"is {one.found}, no proof"
+            findings.append(Finding(rollout_name(one.motion), "certificate", text))
+    return Verification(path, files, [*findings, *verified.findings], why)
+
+
+def _verify_library(path: Path) -> Verification:
+    try:
+        library = MotionLibrary.load(path)
+        faults = library.verify()
+    except FlashdexError as error:
+        return Verification(path, [], [Finding(MANIFEST, "library", str(error))])
+    arrays, meshes = (len(library.manifest[part]) for part in ("arrays", "meshes"))
+    files = [MANIFEST, f"{arrays} arrays", f"{meshes} meshes"]
+    findings = [Finding(str(path), "library", fault) for fault in faults]
+    return Verification(path, [] if faults else files, findings)
+
+
+def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
+    """Read each file of a run but its rollouts; names of whole ones, and faults."""
+    readers: dict[str, Callable[[], object]] = {
+        "its files": partial(check_run, run_dir),
+        RECIPE: partial(read_recipe, run_dir),
+        METRICS: partial(read_metrics, run_dir),
+        SESSIONS: partial(check_sessions, run_dir),
+        DUMP: lambda: read_dump(run_dir / DUMP),
+        **{
+            name: partial(read_object, run_dir, name)
+            for name in (VERSIONS, BASELINES, MOTIONS, EVALUATION)
+        },
+    }
+    files: list[str] = []
+    findings: list[Finding] = []
+
+    def read(name: str, reader: Callable[[], object]) -> None:
+        try:
+            reader()
+            files.append(name)
+        except (FlashdexError, ValueError) as error:
+            findings.append(Finding(name, "file", str(error)))
+
+    for name, reader in readers.items():
+        if name == "its files" or (run_dir / name).exists():
+            read(name, reader)
+    if findings:
+        return files, findings
+    for path in checkpoint_files(run_dir):
+        name = path.name
+        read(f"{CHECKPOINTS}/{name}", partial(_check_checkpoint, run_dir, path))
+        if (run_dir / REPLAY / f"{path.stem}.json").exists():
+            read(f"{REPLAY}/{path.stem}", partial(check_rows, run_dir, path.stem))
+    return files, findings
+
+
+def _check_checkpoint(run_dir: Path, path: Path) -> None:
+    check_format(read_checkpoint(run_dir, path.name), path)
 
 
 class RunPolicy(TensorDictModuleBase):

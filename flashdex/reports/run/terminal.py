@@ -200,6 +200,16 @@ def finding_lines(findings: Sequence[Finding], why: str = "") -> list[str]:
     ]
 
 
+def verification_lines(
+    path: Path, files: Sequence[str], findings: Sequence[Finding], why: str = ""
+) -> list[str]:
+    """What was read and is whole, what differs, what was not checked; a sum last."""
+    faults = sum(finding.is_fault for finding in findings)
+    lines = [f"ok       {printable(name)}" for name in files]
+    end = f"{faults} differ: it is not what flashdex wrote" if faults else "holds"
+    return [*lines, *finding_lines(findings, why), f"{printable(path)}: {end}"]
+
+
 def printable(value: object) -> str:
     """One line of text that a terminal shows as it is."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(value))

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.hands.spec import load_hand
-from flashdex.rollouts.replay import replay
+from flashdex.rollouts.verify import verify_run
 from flashdex.system.jsonl import read_lines
 from flashdex.training.checkpoint import has_checkpoint, load_checkpoint
 from tests.synthetic import write_library
@@ -163,9 +163,9 @@ def check_conversions(run_dir: Path) -> dict[str, Any]:
     """Every conversion has its rollout, and replays as its certificate says."""
     lines = read_lines(run_dir / "conversions.jsonl")
     converted = {line["motion"] for line in lines if line["converted"]}
-    found = {one.motion: one for one in replay(run_dir)}
+    found = {one.motion: one for one in verify_run(run_dir).rollouts}
     assert converted == set(found), (converted, set(found))
-    disagree = [name for name, one in found.items() if not one.agrees]
+    disagree = [name for name, one in found.items() if one.faults]
     assert not disagree, disagree
     return {
         "attempts": len(lines),

@@ -16,7 +16,7 @@ from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.arrays import hash_content
-from flashdex.system.files import own_file, own_folder
+from flashdex.system.files import own_file, own_folder, remove_own
 from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.system.names import check_name, check_names, file_stem
 from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
@@ -186,7 +186,8 @@ class Ledger:
         path = own_file(self.run_dir, named)
         proof = own_file(self.run_dir, certificate_name(rollout.motion))
         # A crash may leave a rollout without certificate, never with that of another.
-        proof.unlink(missing_ok=True)
+        remove_own(self.run_dir, certificate_name(rollout.motion))
+        own_folder(self.run_dir, ROLLOUTS)  # below the run, if that is still there
         rollout.save(path)
         out: dict[str, Any] = {"rollout": named, "rollout_sha256": hash_content(path)}
         if not self.certify:

@@ -239,7 +239,8 @@ def _end(trainer: Trainer, hold: RunHold, why: str) -> None:
         end_session(hold.path, why, env_steps=trainer.env_steps, wall_s=trainer.wall_s)
     # the disk may be what ended it, or the folder is no longer there
     except (OSError, RunError) as error:
-        _LOG.warning("the end of the session is not recorded: %s", error)
+        if why != "error":  # which is told anyhow
+            _LOG.warning("the end of the session is not recorded: %s", error)
 
 
 def make_trainer(

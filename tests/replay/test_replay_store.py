@@ -160,11 +160,11 @@ def test_rows_on_their_way_are_in_the_checkpoint(tmp_path, prefetch):
     log = ReplayLog(tmp_path, one, meaning="m")
     for step in range(3):
         one.push(numbered(10 * step, 10))
-    log.save("1")
+    log.save(f"{1:012d}")
     one.push(numbered(30, 10))
-    log.save("2")
+    log.save(f"{2:012d}")
     two = make_host(stages=2, prefetch=prefetch)
-    assert ReplayLog(tmp_path, two, meaning="m").load("2")
+    assert ReplayLog(tmp_path, two, meaning="m").load(f"{2:012d}")
     assert two.num_rows == one.num_rows == 40
     kept = two.storage[torch.arange(40)]
     assert kept["number"].tolist() == list(range(40))

@@ -37,6 +37,8 @@ ALLOWED = {
     "system/run_files.py",
     "system/machine.py",  # adds up what a folder holds
     "motions/library_writer.py",
+    "motions/library_meshes.py",
+    "motions/library_check.py",
     "system/arrays.py",  # of a library that is being made
     "motions/pipeline/cache.py",
     "recipe/merge.py",

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from flashdex.errors import FlashdexError
@@ -87,7 +88,7 @@ def run_limited(
         "module": function.__module__,
         "function": function.__qualname__,
         "args": args,
-        "path": [os.path.abspath(entry) for entry in sys.path],
+        "path": [*(os.path.abspath(entry) for entry in sys.path), _root(function)],
         "memory": memory,
         "seconds": seconds,
     }
@@ -109,6 +110,12 @@ def run_limited(
     except subprocess.TimeoutExpired:
         raise LimitError(f"it took more than {seconds} s") from None
     return _value_of(done, memory=memory, seconds=seconds)
+
+
+def _root(function: Callable[..., Any]) -> str:
+    """Folder of the function's package: an editable install is not on the path."""
+    package = sys.modules[function.__module__.partition(".")[0]]
+    return str(Path(str(package.__file__)).parents[1])
 
 
 def _value_of(

@@ -3,11 +3,14 @@
 import json
 import math
 import os
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from flashdex.system.limited import LimitError, run_limited
+from flashdex.system.names import file_stem
 
 LIMITS = {"memory": 1 << 30, "seconds": 2}
 
@@ -47,3 +50,13 @@ def test_it_writes_no_file(tmp_path):
     with pytest.raises(LimitError):
         run_limited(os.truncate, str(tmp_path / "file"), 10, **LIMITS)
     assert (tmp_path / "file").stat().st_size == 0
+
+
+def test_an_editable_install_is_found_from_any_folder(monkeypatch, tmp_path):
+    """It is imported by a hook of site-packages, and stands on no path."""
+    root = Path(__file__).parents[2]
+    path = [p for p in sys.path if p and Path(p).resolve() != root]
+    monkeypatch.setattr(sys, "path", path)
+    monkeypatch.chdir(tmp_path)
+    limits = {"memory": 1 << 30, "seconds": 10}
+    assert run_limited(file_stem, "a b", **limits) == file_stem("a b")

@@ -15,11 +15,9 @@ from typing import Any
 from flashdex.errors import FlashdexError
 
 # wall time for each second of CPU time, and s beside: other programs run, too
-(
-    WALL,
-)  # an editable install is found by a hook of site-packages, and stands on no path
+WALL, GRACE = 3.0, 5.0
+# an editable install is found by a hook of site-packages, and stands on no path
 ROOT = str(Path(__file__).parents[2])
-GRACE = 3.0, 5.0
 # The limits stand before anything is imported. What C code prints goes nowhere, and
 # nothing but JSON comes back: whatever happens in there, nothing of it is executed.
 BOOT = """

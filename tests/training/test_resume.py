@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import csv
 import errno
 import itertools
@@ -18,7 +17,7 @@ from flashdex.cli.main import main
 from flashdex.errors import RunError
 from flashdex.motions.library import MotionLibrary
 from flashdex.replay.disk import ReplayLog
-from flashdex.rollouts.ledger import CONVERSIONS, Ledger, RolloutCheck
+from flashdex.rollouts.ledger import CONVERSIONS, Ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import run_lock
 from flashdex.system.jsonl import append_line, keep_lines, read_lines, read_object
@@ -250,23 +249,10 @@ def test_an_interrupted_multirun_does_not_go_on(library, tmp_path, monkeypatch, 
 # what a crash leaves between a stored rollout and its line
 
 
-@pytest.fixture(scope="module")
-def attempts(roll_tiny):
-    return roll_tiny(lambda td, env: torch.zeros(env.num_envs, 2, 18))
-
-
 @pytest.fixture
-def passing(attempts, monkeypatch):
-    """An attempt whose objects are written onto the reference, so that it passes.
-
-    That this was done is found elsewhere (``tests/rollouts``), and not looked for here.
-    """
-    monkeypatch.setattr(RolloutCheck, "run", lambda check: [])
-    rollout = copy.deepcopy(attempts[0])
-    rollout.object_pos = rollout.ref_object_pos.copy()
-    rollout.object_quat = rollout.ref_object_quat.copy()
-    rollout.env_steps = 70
-    return rollout
+def passing(converted_run):
+    """A rollout that a run found to pass, and stored."""
+    return Rollout.load(converted_run / "rollouts/right_box.npz")
 
 
 def open_ledger(folder, library, **changes):
@@ -289,9 +275,9 @@ def test_a_rollout_without_a_line_is_adopted(tmp_path, library, passing, certifi
     if not certificate:
         (tmp_path / "rollouts/right_box.certificate.json").unlink()
     again = open_ledger(tmp_path, library)
-    assert again.num_converted == 0
+    assert again.num_passed == 0
     assert again.adopt(wall_s=9.0) == ["right_box"]
-    assert again.num_converted == 1
+    assert again.num_passed == 1
     assert read_lines(tmp_path / CONVERSIONS) == [{**line, "wall_s": 9.0}]
     assert (tmp_path / "rollouts/right_box.certificate.json").is_file()
     stored = Rollout.load(tmp_path / line["rollout"])
@@ -300,10 +286,18 @@ def test_a_rollout_without_a_line_is_adopted(tmp_path, library, passing, certifi
     assert open_ledger(tmp_path, library).adopt(wall_s=10.0) == []
 
 
-def test_a_later_pass_without_a_line_is_adopted(tmp_path, library, passing):
+def test_a_later_pass_without_a_line_is_adopted(
+    tmp_path, library, passing, monkeypatch
+):
+    def refuse(*args, **options):
+        raise RunError("it cannot be certified today")
+
     ledger = open_ledger(tmp_path, library)
-    ledger.record(passing, wall_s=2.0)
-    assert not ledger.conversions["right_box"]["certified"]  # its objects were moved
+    passing.env_steps = 70
+    with monkeypatch.context() as patch:
+        patch.setattr("flashdex.rollouts.ledger.certify", refuse)
+        ledger.record(passing, wall_s=2.0)
+    assert not ledger.conversions["right_box"]["certified"]
     passing.env_steps = 90
     ledger.record(passing, wall_s=3.0)
     cut_line(tmp_path)

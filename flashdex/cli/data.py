@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -177,17 +178,28 @@ def _baselines(args: argparse.Namespace) -> int:
 
         recipe = compose(args.recipe, args.overrides)
     bench = RunBuilder.from_recipe(expect_kind(recipe, Recipe, where="baselines"))
-    if args.out is not None:
-        args.out.unlink(missing_ok=True)  # scores of another time are no answer
-    say(format_baselines(score_baselines(bench, args.out)))
+    try:
+        if args.out is not None:
+            args.out.unlink(missing_ok=True)  # scores of another time are no answer
+        found = score_baselines(bench, args.out)
+    except OSError as error:
+        if args.out is None:
+            raise
+        raise FlashdexError(f"--out: {args.out} cannot be written ({error})") from error
+    say(format_baselines(found))
     return 0
 
 
 def _check_writable(path: Path) -> None:
     """Say before the work that a file cannot be written; nothing is changed."""
-    fault = "a folder" if path.is_dir() else ""
-    if not os.access(path if path.is_file() else path.parent, os.W_OK):
+    is_there = os.path.lexists(path)
+    fault = ""
+    if not os.access(path if is_there else path.parent, os.W_OK):
         fault = "may not" if path.parent.is_dir() else f"there is no {path.parent}"
+    if is_there and not stat.S_ISREG(path.lstat().st_mode):
+        fault = "a folder" if path.is_dir() else "a link, a pipe or a device"
+    elif not path.parent.is_dir():
+        fault = f"there is no folder {path.parent}"
     if fault:
         raise FlashdexError(
             f"--out: {path} cannot be written ({fault}). Give a file in a folder that "

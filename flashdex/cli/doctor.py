@@ -174,7 +174,7 @@ def _graphics() -> Finding:
     for backend in tried:
         try:
             result = subprocess.run(
-                [sys.executable, "-c", _RENDER],
+                [sys.executable, "-P", "-c", _RENDER],
                 env={**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend},
                 capture_output=True,
                 timeout=60,

@@ -31,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # torch is first imported, so it has to stand before every lazy import below.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # likewise, by torchrl
+    # Processes that this one starts import nothing from the folder we are in.
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
     with loading():
         set_up_streams()
         args = _read_arguments(sys.argv[1:] if argv is None else list(argv))

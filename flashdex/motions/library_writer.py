@@ -45,7 +45,7 @@ NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
 # folders of a library's data, the one that is being written too
 DATA = re.compile(r"\.?data-[0-9a-f]{16}")
 TEMPORARY = re.compile(r"\.manifest\.json\.\d+\.tmp")
-LOCK, REPORT = ".library.lock", "report.csv"
+LOCK, REPORT, PAGE = ".library.lock", "report.csv", "report.html"
 # what schema 1 kept beside its manifest
 OLD_PARTS = ("frames", "motions", "objects", "quality", "meshes")
 
@@ -117,9 +117,11 @@ class LibraryWriter:
         if not self._records:
             raise LibraryError(f"{self.path}: no motion was kept; nothing to write.")
         check_target(self.path)
-        is_new = not self.path.exists()
+        # exists of os: what no path can be, over-long or with NUL, is not there
+        is_new = not os.path.exists(self.path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            check_target(self.path)  # 'new/../old' leads there only now
             with waiting_lock(self.path / "library"):
                 self._replace(report)
         except OSError as error:
@@ -128,7 +130,7 @@ class LibraryWriter:
                 f"space and permissions of {self.path.absolute().parent}."
             ) from error
         finally:
-            if is_new and not (self.path / MANIFEST).exists():
+            if is_new and not os.path.exists(self.path / MANIFEST):
                 _remove_empty(self.path)
         return self.path
 
@@ -241,6 +243,8 @@ def check_target(path: Path) -> None:
     Raises:
         LibraryError: it holds other files, is none, or cannot be written.
     """
+    if "\0" in str(path):
+        raise LibraryError(f"{str(path)!a}: cannot be a path.")
     folder = path
     while not os.path.lexists(folder) and folder != folder.parent:
         folder = folder.parent
@@ -255,6 +259,11 @@ def check_target(path: Path) -> None:
             f"{path}: could not write the library: {folder} refuses ({error.strerror})."
         ) from error
     if folder is path:
+        blocked = [n for n in (REPORT, PAGE) if _is_folder(path / n)]
+        if blocked:
+            raise LibraryError(
+                f"{path / blocked[0]}: is a folder, a library has a file of this name."
+            )
         held = [n for n in os.listdir(path) if n != LOCK]
         ours = [n for n in held if DATA.fullmatch(n) or TEMPORARY.fullmatch(n)]
         if len(ours) < len(held) and not _is_library(path):
@@ -262,6 +271,11 @@ def check_target(path: Path) -> None:
                 f"{path} exists and is not a motion library; it is not replaced. Name "
                 "another folder, or empty this one."
             )
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether it is a folder itself, no link to one."""
+    return path.is_dir() and not path.is_symlink()
 
 
 def _is_library(path: Path) -> bool:
@@ -308,8 +322,9 @@ def _clean(path: Path, *, parts: tuple[str, ...]) -> None:
         return
     for name in os.listdir(path):
         if name != keep and (DATA.fullmatch(name) or name in parts):
-            # of a link only complains, and never follows one
-            shutil.rmtree(path / name, ignore_errors=True)
+            # folders only: of a pipe it would wait for a writer
+            if _is_folder(path / name):
+                shutil.rmtree(path / name, ignore_errors=True)
         elif TEMPORARY.fullmatch(name):
             with suppress(OSError):
                 (path / name).unlink()

@@ -5,6 +5,7 @@ Nothing here imports the schema, which would import torch.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -198,12 +199,12 @@ def copy_recipe(name_or_path: str | Path, destination: str | Path) -> Path:
         target = target / source.name
     if target.suffix not in (".yaml", ".yml"):
         target = target.with_name(f"{target.name}.yaml")
+    if os.path.lexists(target):
+        raise FlashdexError(f"{target}: exists already; choose another name")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8") as file:
             file.write(text)
-    except FileExistsError as error:
-        raise FlashdexError(f"{target}: exists already; choose another name") from error
     except (OSError, ValueError) as error:
         raise FlashdexError(f"{target}: cannot be written ({error})") from error
     return target

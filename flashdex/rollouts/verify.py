@@ -30,7 +30,13 @@ from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_files
 from flashdex.system.names import file_stem
-from flashdex.system.run_files import RECIPE, read_metrics, read_recipe, read_sessions
+from flashdex.system.run_files import (
+    RECIPE,
+    check_run,
+    read_metrics,
+    read_recipe,
+    read_sessions,
+)
 
 CERTIFICATE = ".certificate.json"
 MAX_JSON = 16 << 20  # bytes of a certificate
@@ -113,6 +119,7 @@ class _RunCheck:
         self.findings.append(Finding(file, what, text))
 
     def run(self) -> Verified:
+        check_run(self.run_dir)  # a link under the name of any file of a run
         files = own_files(self.run_dir, ROLLOUTS, "*.npz")
         self._baselines = self._passing_baselines()
         lines = self._lines()

@@ -94,8 +94,9 @@ def run_limited(
         "memory": memory,
         "seconds": seconds,
     }
-    # one arena: every thread would reserve 64 MB of address space otherwise
-    env = {**os.environ, "MALLOC_ARENA_MAX": "1"}
+    # one arena: every thread would reserve 64 MB of address space otherwise; glfw
+    # starts a Python of its own, which must not import from the folder of all users
+    env = {**os.environ, "MALLOC_ARENA_MAX": "1", "PYTHONSAFEPATH": "1"}
     try:
         done = subprocess.run(
             # isolated, without site: its path is ours, not that of the folder we are in

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 
@@ -115,6 +116,21 @@ def test_cp_then_validate(run, tmp_path):
     code, _, err = run("validate", str(tmp_path), "bench50_xhand")
     assert code == 2
     assert "env.num_env: unknown key" in err
+
+
+def test_cp_below_a_file_says_so(run, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    code, _, err = run("cp", "quickstart", str(tmp_path / "file/x"))
+    assert code == 2
+    assert "cannot be written" in err
+
+
+def test_processes_of_a_command_import_nothing_from_the_folder_we_are_in(
+    run, monkeypatch
+):
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    run("ls")
+    assert os.environ["PYTHONSAFEPATH"] == "1"
 
 
 def test_doctor_looks_at_everything():

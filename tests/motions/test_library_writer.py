@@ -144,6 +144,37 @@ def test_what_is_no_library_is_refused_before_the_work(tmp_path, monkeypatch, ca
     assert snapshot(tmp_path) == before
 
 
+def test_a_pipe_among_its_data_is_not_waited_for(copy, record):
+    pipe = copy / "data-0123456789abcdef"
+    os.mkfifo(pipe)
+    assert MotionLibrary.load(write([record], copy)).num_motions == 1
+    assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize("name", ["report.csv", "report.html"])
+def test_a_folder_in_the_place_of_a_report_is_refused(copy, record, name):
+    (copy / name).unlink(missing_ok=True)
+    (copy / name).mkdir()
+    before = snapshot(copy)
+    with pytest.raises(LibraryError, match=f"{name}: is a folder"):
+        write([record], copy)
+    assert snapshot(copy) == before
+
+
+def test_a_path_over_a_folder_that_is_not_there_yet_is_checked(tmp_path, record):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/report.csv").write_text("mine")
+    with pytest.raises(LibraryError, match="not a motion library"):
+        write([record], tmp_path / "new/../mine")
+    assert os.listdir(tmp_path / "mine") == ["report.csv"]
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300], ids=["nul", "long"])
+def test_what_cannot_be_a_path_is_refused(tmp_path, record, name):
+    with pytest.raises(LibraryError):
+        write([record], tmp_path / name)
+
+
 def test_only_data_of_libraries_is_removed(copy, record, tmp_path):
     for name in ("frames", "notes", "data-mine", "data-" + "0" * 15):
         thesis(copy / name)

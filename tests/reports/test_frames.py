@@ -1,6 +1,7 @@
 """Films: the camera against MuJoCo's own, and pictures where a back end draws."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,10 +12,13 @@ import pytest
 import yaml
 from PIL import Image
 
+import flashdex
 from flashdex.reports.render import films
 from flashdex.reports.render.films import NO_GRAPHICS, Film, draw_films, find_backend
+from flashdex.reports.render.rollout import HEIGHT, WIDTH, Painter, write_film
 from flashdex.reports.render.scene import MARGIN, fit_view, view_axes
 from flashdex.reports.run.report import write_report
+from flashdex.system.names import file_stem
 
 DRAW = """
 import sys, numpy as np
@@ -101,6 +105,51 @@ def test_the_picture_shows_object_and_ghost(rollout, tmp_path, backend):
     assert red > 500  # the box itself
     assert blue(apart) > 500  # the ghost above it
     assert blue(same) < 50  # no ghost where there is no error
+
+
+def test_the_folder_we_are_in_is_no_code(tmp_path, monkeypatch):
+    (tmp_path / "mujoco.py").write_text("raise SystemExit('ran')")
+    monkeypatch.chdir(tmp_path)
+    assert films.run_drawer(["-c", "import mujoco"], "none", timeout=60) != "ran"
+
+
+def test_what_draws_is_this_very_flashdex(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = f"import flashdex; assert flashdex.__file__ == {flashdex.__file__!r}"
+    assert films.run_drawer(["-c", text], "none", timeout=60) == ""
+
+
+def test_files_of_two_films_are_never_the_same(tmp_path):
+    stems = ("lift", "lift_poster", "lift.poster", "lift~poster")
+    rollouts = [tmp_path / f"rollouts/{file_stem(stem)}.npz" for stem in stems]
+    every = [file for rollout in rollouts for file in Film.of(rollout).files]
+    assert len(set(every)) == len(every)
+
+
+def test_the_encoder_follows_no_link(rollout, tmp_path, monkeypatch):
+    kept = tmp_path / "kept"
+    kept.write_text("mine")
+    film = Film.at(tmp_path / "films" / "one")
+    film.video.parent.mkdir()
+    half = film.video.with_name(f".one.{os.getpid()}.tmp.mp4")
+    half.symlink_to(kept)
+
+    class Still(Painter):
+        def __init__(self, rollout):
+            pass
+
+        def draw(self, frame):
+            return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+        draw_still = draw
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr("flashdex.reports.render.rollout.Painter", Still)
+    write_film(rollout, film)
+    assert film.is_whole
+    assert kept.read_text() == "mine"
 
 
 def test_films_of_a_run(run_dir, backend):

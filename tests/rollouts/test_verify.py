@@ -213,6 +213,14 @@ def test_a_link_in_the_place_of_a_file_is_refused(spoilt_run, tmp_path):
         verify_run(spoilt_run)
 
 
+@pytest.mark.parametrize("name", ["recipe.yaml", "metrics.csv", "films"])
+def test_a_link_to_nothing_under_any_name_is_refused(spoilt_run, tmp_path, name):
+    (spoilt_run / name).unlink(missing_ok=True)
+    (spoilt_run / name).symlink_to(tmp_path / "nothing")
+    with pytest.raises(RunError, match=name):
+        verify_run(spoilt_run)
+
+
 def test_a_library_that_was_changed_is_told(spoilt_run, truth, monkeypatch):
     monkeypatch.setattr(truth.library, "content_hash", "0" * 64)
     found = [str(f) for f in verify_run(spoilt_run, truth).findings]

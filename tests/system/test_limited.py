@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -41,6 +42,12 @@ def test_sleeping_counts_as_time(monkeypatch):
     with pytest.raises(LimitError, match="more than 1 s"):
         run_limited(time.sleep, 60, memory=1 << 30, seconds=1)
     assert time.monotonic() - start < 10
+
+
+def test_what_it_starts_imports_nothing_from_where_it_is():
+    text = "1 if os.environ.get('PYTHONSAFEPATH') else 0"
+    words = [sys.executable, "-c", f"import os; raise SystemExit({text})"]
+    assert run_limited(subprocess.call, words, **LIMITS) == 1
 
 
 def test_it_writes_no_file(tmp_path):

@@ -52,6 +52,23 @@ def test_command_scores_a_library(library, tmp_path, capsys):
     assert list(scores["do_nothing"]) == library.names
 
 
+@pytest.mark.parametrize("kind", ["link", "pipe", "below_a_file"])
+def test_out_is_a_file_of_its_own_or_refused(tmp_path, capsys, kind):
+    kept, out = tmp_path / "kept", tmp_path / "out.json"
+    kept.write_text("mine")
+    if kind == "link":
+        out.symlink_to(kept)
+    elif kind == "pipe":
+        os.mkfifo(out)
+    else:
+        out = kept / "out.json"
+    assert main(["baselines", "quickstart", "--out", str(out)]) == 2
+    assert f"--out: {out} cannot be written" in capsys.readouterr().err
+    assert kept.read_text() == "mine"
+    assert kind == "below_a_file" or os.path.lexists(out)
+    assert kind != "pipe" or out.is_fifo()
+
+
 def test_gym_recipe_has_no_baselines(capsys):
     assert main(["baselines", "gym_halfcheetah"]) == 2
     assert "gym" in capsys.readouterr().err

@@ -36,7 +36,8 @@ class Film:
     @classmethod
     def at(cls, base: Path) -> Film:
         """Files that have the name ``base``, which has no suffix."""
-        endings = (".mp4", ".png", "_poster.png")
+        # no motion's file has a "~" in it: "lift" and "lift_poster" stay apart
+        endings = (".mp4", ".png", "~poster.png")
         return cls(*(base.with_name(base.name + ending) for ending in endings))
 
     @classmethod
@@ -120,7 +121,7 @@ def find_backend() -> str | None:
 
 def run_drawer(words: list[str], backend: str, *, timeout: float) -> str:
     """Run Python with a graphics back end; return what went wrong, in one line."""
-    package = Path(__file__).parents[2]
+    package = Path(__file__).parents[3]  # the folder that flashdex lies in
     paths = [str(package), os.environ.get("PYTHONPATH", "")]
     environment = {
         **os.environ,
@@ -130,7 +131,8 @@ def run_drawer(words: list[str], backend: str, *, timeout: float) -> str:
     }
     try:
         done = subprocess.run(
-            [sys.executable, *words],
+            # -P: what lies in the folder we are in is data, not code
+            [sys.executable, "-P", *words],
             env=environment,
             capture_output=True,
             text=True,

@@ -104,6 +104,7 @@ def write_film(rollout: Rollout, film: Film) -> None:
     last = rollout.num_frames - 1
     painter = Painter(rollout)
     try:
+        half.unlink(missing_ok=True)  # the encoder would follow a link that waits here
         spread = np.linspace(0, last, NUM_STILLS).round().astype(int).tolist()
         stills = [Image.fromarray(painter.draw_still(t)) for t in spread]
         frames = (painter.draw(t) for t in range(0, rollout.num_frames, stride))

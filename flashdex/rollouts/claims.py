@@ -24,6 +24,7 @@ from flashdex.system.run_files import (
     BASELINES,
     MOTIONS,
     RECIPE,
+    SESSIONS,
     VERSIONS,
     read_metrics,
     read_recipe,
@@ -31,6 +32,7 @@ from flashdex.system.run_files import (
     run_id,
 )
 
+BASELINE_NAMES = ("do_nothing", "kinematic_playback", "frozen_object")
 MAX_JSON = 16 << 20  # bytes of a certificate
 
 
@@ -104,6 +106,8 @@ class RunClaims:
                 self.fault(where, text)
             if self.motions and line["motion"] not in self.motions:
                 self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
+        if lines and self.is_bound and not self._sessions():
+            self.fault("lines", "there are none", file=SESSIONS)
         self._proofs(lines)
         self._counts(lines)
         return lines
@@ -160,6 +164,10 @@ class RunClaims:
         if fault:
             self.fault("file", fault, file=path.name)
             return None
+        for name in BASELINE_NAMES if self.is_bound else ():
+            for motion in self.motions:
+                if not isinstance(at(rows, name, motion, "passed"), list):
+                    self.fault(name, f"no score of '{motion}'", file=path.name)
         found: dict[tuple[str, str], list[str]] = {}
         for name, motions in rows.items():
             for motion in motions if isinstance(motions, dict) else ():

@@ -11,7 +11,7 @@ from tamper import BOX, PROOF
 from flashdex.metrics.tally import UNMOVED
 from flashdex.rollouts.certificate import certify
 from flashdex.rollouts.ledger import CONVERSIONS
-from flashdex.rollouts.rollout import Rollout, bindings_of
+from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.verify import verify_run
 from flashdex.system.jsonl import read_lines, read_object, write_lines, write_object
 
@@ -93,6 +93,8 @@ LIES = {
         "motions.json",
     ),
     "no baselines": lambda run: (run / "baselines.json").unlink(),
+    "empty baselines": lambda run: (run / "baselines.json").write_text("{}"),
+    "no sessions": lambda run: (run / "sessions.jsonl").unlink(),
     "proof of another": proof(identity={"rollout_sha256": "0" * 64}),
     "proof by another criterion": proof(identity={"criterion": "sr_loose"}),
     "proof of other seeds": proof(provenance={"seed": 77}),
@@ -126,7 +128,6 @@ def overridden(run, change, *, physics=()):
     data["provenance"] = np.asarray(json.dumps(said))
     tamper.forge(run, run / BOX, data)
     rollout = Rollout.load(run / BOX)
-    assert said | bindings_of(rollout) == json.loads(rollout.provenance)
     model = mujoco.MjModel.from_xml_string(rollout.model_xml)
     certify(rollout, model=model).save(run / PROOF)
     tamper.reseal(run, run / BOX, run / PROOF)

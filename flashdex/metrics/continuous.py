@@ -15,6 +15,7 @@ AUC_THRESHOLDS = tuple(k / 100 for k in range(1, 10))  # m
 PROBE = 0.05  # m, arm of the six body-fixed points of MPPE
 MIN_LIFT = 0.02  # m, reference rise below which the lift ratio has no meaning
 MIN_PATH = 0.03  # m, reference path below which the path ratio has no meaning
+MIN_REACH = 0.02  # m, of the reference from its start, to be followed
 RULER = 0.01  # m, by which a path is measured: noise at rest is no path
 
 
@@ -106,6 +107,19 @@ def path_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
     """
     ref = ruler_path(ref_pos)
     return ruler_path(pos) / ref if ref >= MIN_PATH else None
+
+
+def follow_ratio(pos: Tensor, ref_pos: Tensor) -> float | None:
+    """How much of the reference's way from its start is gone, at its times.
+
+    The factor by which the reference's displacements fit those simulated best: 1 along
+    with it, 0 at rest, trembling or across, negative the other way. None if it never is
+    2 cm from its start. Positions are world, m, (T, 3).
+    """
+    way, ref = pos - pos[0], ref_pos - ref_pos[0]
+    if float(torch.linalg.vector_norm(ref, dim=-1).max()) < MIN_REACH:
+        return None
+    return float((way * ref).sum() / ref.square().sum())
 
 
 def off_by(ratio: float | None) -> float:

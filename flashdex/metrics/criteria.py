@@ -13,7 +13,12 @@ import torch
 from torch import Tensor
 
 from flashdex.keys import SIDES, Side
-from flashdex.metrics.continuous import lift_ratio, off_by, path_ratio
+from flashdex.metrics.continuous import (
+    follow_ratio,
+    lift_ratio,
+    off_by,
+    path_ratio,
+)
 from flashdex.metrics.criteria_table import (
     Blame,
     Criterion,
@@ -33,6 +38,7 @@ from flashdex.metrics.errors import (
 
 __all__ = ["Limits", "criterion_names", "make_criteria", "resolve_criterion", "score"]
 
+MIN_FOLLOW = 0.5  # share of the reference's way below which an object stays behind
 STATIC_DRIFT = 1e-3  # m; a reference that moves less on average counts as static
 
 
@@ -54,6 +60,22 @@ def worst_movement(errors: TrackingErrors) -> dict[str, float | None]:
         )
         for key in ("lift", "path")
     }
+
+
+def stays_behind(errors: TrackingErrors) -> bool:
+    """A hand's object moves too little, or not the way that the reference goes."""
+    if not errors.is_finite:
+        return False
+    for slot in dict.fromkeys(errors.slots):
+        track = errors.object_track(slot)
+        if track is None or len(track[0]) == 0:
+            continue
+        follows = follow_ratio(*track)
+        if moves_too_little(movement(errors, slot)) or (
+            follows is not None and follows < MIN_FOLLOW
+        ):
+            return True
+    return False
 
 
 def moves_too_little(ratios: Mapping[str, float | None]) -> bool:

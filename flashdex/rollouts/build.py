@@ -14,9 +14,8 @@ from flashdex.envs.reference import ReferenceBank
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.kinematics import HandKinematics
 from flashdex.hands.spec import HandSpec
-from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.recorder import Episode
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout, bindings_of
 
 GRACE_S = 0.25  # s; 15 steps at 60 Hz, as the criteria define it
 

@@ -260,11 +260,21 @@ def compare_certificates(
     if schema == CERTIFICATE_SCHEMA and here != there:
         text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
         found.append(Finding(file, "numbers", text, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        del stored["nominal"], new["nominal"]
+        stored, new = _same_anywhere(stored), _same_anywhere(new)
     return found + [
         Finding(file, text.split(" ")[0], text) for text in differences(stored, new)
     ]
+
+
+def _same_anywhere(certificate: dict[str, Any]) -> dict[str, Any]:
+    """What does not depend on where a certificate was made."""
+    names = ("verdict", "identity", "inputs", "provenance")
+    return {
+        name: {k: v for k, v in part.items() if f"{name}.{k}" not in ELSEWHERE}
+        if isinstance(part := certificate.get(name), dict)
+        else part
+        for name in names
+    }
 
 
 def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:

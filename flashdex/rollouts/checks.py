@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import mujoco
@@ -18,7 +18,7 @@ from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
 from flashdex.hands.spec import load_hand
 from flashdex.metrics.criteria_table import resolve_criterion
-from flashdex.rollouts.bindings import bindings_of
+from flashdex.recipe import validate
 from flashdex.rollouts.build import grace_steps, link_names
 from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
 from flashdex.rollouts.findings import OLD, Finding, differences, short
@@ -27,9 +27,10 @@ from flashdex.rollouts.resimulation import (
     Simulation,
     load_simulation,
     object_poses,
+    simulate,
     tracked_points,
 )
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout, bindings_of
 from flashdex.rollouts.safety import state_deviation
 from flashdex.rollouts.truth import Truth, settings_of
 from flashdex.system.machine import versions
@@ -46,7 +47,7 @@ _UNFIT = (ValueError, KeyError, TypeError, IndexError, OverflowError)
 MAX_SUBSTEPS = 1_000_000  # of a file that says itself how many; an hour at 60 Hz
 # of the file alone: no library says them, hashes bind them
 _UNBOUND = {"provenance", "versions", "errors", "env_steps", "model_xml"}
-_OF_RECIPE = {"ctrl", "criterion", "seed"}  # what an override may change in a run
+_OF_RECIPE = {"ctrl", "criterion"}  # what an override may change in a run
 _STATES = {"qpos", "qvel"}  # simulated anew, see ``_states``
 
 
@@ -167,7 +168,7 @@ class RolloutCheck:
         """The stored model against one built anew; sets what may be simulated."""
         r = self.rollout
         where = f"{self.file}: model_xml"
-        truth = self.truth if self.is_current else None
+        truth = self._scenes()
         if truth is None or r.motion not in truth.bank.names:
             self.model = compile_mjcf(r.model_xml, where=where)
             self._model_alone(self.model)
@@ -185,6 +186,21 @@ class RolloutCheck:
         bodies = load_simulation(r, scene.model).object_body
         for name, text in implausible(scene.model, bodies).items():
             self.skip(f"model {name}", f"{text}, by recipe and library themselves")
+
+    def _scenes(self) -> Truth | None:
+        """Library and physics of its scene; the file names those of another recipe."""
+        if self.truth is None or self.is_current:
+            return self.truth
+        settings = self._settings()
+        if settings is None:
+            return None
+        self.skip("physics", "settings and controls: the recipe changed since then")
+        try:
+            recipe = replace(self.truth.recipe, physics=settings)
+            return replace(self.truth, recipe=validate(recipe))
+        except FlashdexError as error:
+            self.fault("physics", f"are no settings ({error})")
+            return None
 
     def _model_alone(self, model: mujoco.MjModel) -> None:
         """Without library: everything but shapes, masses and supports."""
@@ -368,30 +384,3 @@ def _machine(made_by: dict[str, Any]) -> str:
     """Kind of processor: ``x86_64`` of ``NVIDIA H200, x86_64, 16 CPU cores``."""
     words = str(made_by.get("hardware", "")).split(", ")
     return words[-2] if len(words) > 1 else ""
-
-
-def simulate(
-    model: mujoco.MjModel, rollout: Rollout, *, single: bool = False
-) -> dict[str, np.ndarray]:
-    """States of the controls in MuJoCo C with the settings of the model, nothing more.
-
-    Args:
-        model: as stored, or built anew.
-        rollout: first state and controls.
-        single: begin every control step from the stored state before it.
-
-    Returns:
-        ``qpos`` (T, nq) and ``qvel`` (T, nv).
-    """
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = rollout.qpos0, rollout.qvel0
-    if rollout.act0 is not None and model.na:
-        data.act[:] = rollout.act0
-    out = {"qpos": np.empty_like(rollout.qpos), "qvel": np.empty_like(rollout.qvel)}
-    for t, row in enumerate(rollout.ctrl):
-        if single and t:
-            data.qpos[:], data.qvel[:] = rollout.qpos[t - 1], rollout.qvel[t - 1]
-        data.ctrl[:] = row
-        mujoco.mj_step(model, data, nstep=rollout.decimation)
-        out["qpos"][t], out["qvel"][t] = data.qpos, data.qvel
-    return out

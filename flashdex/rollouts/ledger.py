@@ -11,7 +11,8 @@ from typing import Any
 import mujoco
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.metrics.criteria import moves_too_little
+from flashdex.metrics.criteria import moves_too_little, stays_behind
+from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.rollout import Rollout
@@ -22,7 +23,6 @@ from flashdex.system.names import check_name, check_names, file_stem
 from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
 
 _LOG = logging.getLogger(__name__)
-UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
 # what a line holds, of any version
 LINE: dict[str, type | tuple[type, ...]] = {
     "motion": str,
@@ -73,17 +73,7 @@ def certificate_name(motion: str) -> str:
     return f"{ROLLOUTS}/{file_stem(motion)}.certificate.json"
 
 
-def is_trivial(line: dict[str, Any]) -> bool:
-    """A conversion that needed no learning, or in which the object hardly moved."""
-    return bool(line.get("trivial"))
-
-
-def _is_more(line: dict[str, Any], before: dict[str, Any]) -> bool:
-    """A pass in which the object moves, after one in which it hardly did."""
-    return UNMOVED in before.get("trivial", []) and UNMOVED not in line["trivial"]
-
-
-class Ledger:
+class Ledger(Tally):
     """Scores attempts, writes a line for each, stores the first that passes.
 
     A stored rollout is on disk, complete, before its line is written: a crash can lose
@@ -109,18 +99,10 @@ class Ledger:
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.path = run_dir, own_file(run_dir, CONVERSIONS)
         self.rollouts = own_folder(run_dir, ROLLOUTS)
-        self.names, self.criterion, self.seed = names, criterion, seed
-        self.engine, self.on_gpu = engine, on_gpu
+        self.seed, self.engine, self.on_gpu = seed, engine, on_gpu
         self.certify, self.trivial = certify, trivial or {}
-        # motion -> line of its first pass, with the newest verdict
-        self.conversions: dict[str, dict[str, Any]] = {}
-        self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
-        self.attempts: dict[str, int] = dict.fromkeys(names, 0)  # motion -> lines
         drop_cut_line(self.path)
-        for line in read_ledger(self.path):  # of earlier sessions
-            # A resume may ask for another criterion, or for fewer motions.
-            if line["criterion"] == criterion and line["motion"] in names:
-                self.count(line)
+        super().__init__(names, criterion, read_ledger(self.path))  # earlier sessions
 
     def record(
         self, rollout: Rollout, *, wall_s: float, is_own: bool = True
@@ -144,38 +126,29 @@ class Ledger:
             "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
-            "trivial": self._trivial(name, summary),
+            "trivial": self._trivial(rollout),
         }
         before = self.conversions.get(name)
-        # One lucky draw is not the last word: later passes may still be proven.
+        # One lucky draw is not the last word: later passes may still be proven, but not
+        # by one in which the object moves less.
         is_wanted = (
             before is None
-            or (self.certify and not before["certified"])
-            or _is_more(line, before)
+            or self.moves_more(line, before)
+            or (
+                self.certify
+                and not before["certified"]
+                and not self.moves_more(before, line)
+            )
         )
         if line["converted"] and is_wanted:
             line.update(self._store(rollout, line["errors"], is_own=is_own))
         append_line(self.path, line)
         return line, self.count(line)
 
-    def _trivial(self, name: str, summary: dict[str, Any]) -> list[str]:
+    def _trivial(self, rollout: Rollout) -> list[str]:
         """Baselines that pass the motion, and whether this attempt moved too little."""
-        ratios = {key: summary[f"{key}_ratio"] for key in ("lift", "path")}
-        unmoved = [UNMOVED] if moves_too_little(ratios) else []
-        return [*self.trivial.get(name, []), *unmoved]
-
-    def count(self, line: dict[str, Any]) -> bool:
-        """Count a line that is in the file; is it the motion's first that passes?"""
-        name = line["motion"]
-        self.attempts[name] = self.attempts.get(name, 0) + 1
-        self.last[name] = line["converted"]
-        is_first = line["converted"] and name not in self.conversions
-        if is_first or (line["converted"] and _is_more(line, self.conversions[name])):
-            self.conversions[name] = dict(line)
-        if line.get("verdict") is not None and name in self.conversions:
-            newest = {key: line.get(key) for key in ("certified", "verdict")}
-            self.conversions[name].update(newest)
-        return is_first
+        unmoved = [UNMOVED] if stays_behind(rollout.tracking_errors()) else []
+        return [*self.trivial.get(rollout.motion, []), *unmoved]
 
     def _store(
         self, rollout: Rollout, errors: dict[str, float], *, is_own: bool
@@ -254,58 +227,45 @@ class Ledger:
         """Length of the file."""
         return self.path.stat().st_size if self.path.is_file() else 0
 
-    @property
-    def note(self) -> str:
-        """What was achieved, in a few words: what is not trivial first."""
-        text = f"{self.num_converted} of {len(self.names)} converted"
-        if self.num_converted:
-            text += f", {self.num_certified} certified"
-        return f"{text}, and {self.num_trivial} trivial" if self.num_trivial else text
 
-    @property
-    def num_attempts(self) -> int:
-        """Attempts of all motions."""
-        return sum(self.attempts.values())
+# what every line holds since runs have an id, and of which one run has one value
+NEWER = ("passed", "trivial", "lift_ratio", "path_ratio", "seed", "engine")
+OF_RUN = ("seed", "engine", "criterion")
+SPEED = "convert/per_hour"  # of a clock that went on between two readings
+SPEED_TOLERANCE = 0.05
 
-    @property
-    def num_passed(self) -> int:
-        """Motions with at least one passing attempt, trivial ones too."""
-        return len(self.conversions)
 
-    @property
-    def _earned(self) -> list[dict[str, Any]]:
-        return [c for c in self.conversions.values() if not is_trivial(c)]
+def line_faults(line: dict[str, Any], of_run: dict[str, Any]) -> list[str]:
+    """What a line of a run with an id lacks, or says against itself or its run."""
+    found = [f"lacks {key!a}" for key in NEWER if key not in line]
+    found += [
+        f"{key} is {line[key]!a:.60}, of the run {of_run[key]!a:.60}"
+        for key in OF_RUN
+        if key in line and key in of_run and line[key] != of_run[key]
+    ]
+    ratios = {key: line.get(f"{key}_ratio") for key in ("lift", "path")}
+    passes = line["criterion"] in line.get("passed", [])
+    if passes and moves_too_little(ratios) and not is_unmoved(line):
+        found.append(f"lacks '{UNMOVED}' in trivial, by its ratios")
+    return found
 
-    @property
-    def num_converted(self) -> int:
-        """Motions with a passing attempt that is not trivial."""
-        return len(self._earned)
 
-    @property
-    def num_trivial(self) -> int:
-        """Motions whose passing attempt is trivial."""
-        return self.num_passed - self.num_converted
-
-    @property
-    def num_certified(self) -> int:
-        """Converted motions, not trivial, whose certificate holds."""
-        return sum(bool(c["certified"]) for c in self._earned)
-
-    def metrics(self, hours: float) -> dict[str, float]:
-        """Counters of the ``convert/`` group after so many hours of wall time."""
-        total = len(self.names)
-        passing = sum(self.last.get(n, False) for n in self.names)
-        every = self.conversions.values()
-        out = {
-            "convert/nontrivial": float(self.num_converted),
-            "convert/trivial": float(self.num_trivial),
-            "convert/cumulative": float(self.num_passed),
-            "convert/rate": self.num_passed / total,
-            "convert/last": passing / total,
-            "convert/certified": float(sum(bool(c["certified"]) for c in every)),
-            "convert/robust": float(sum(c.get("verdict") == "robust" for c in every)),
-            "convert/attempts": float(self.num_attempts),
-        }
-        if hours > 0:
-            out["convert/per_hour"] = self.num_passed / hours
-        return out
+def count_faults(
+    records: list[dict[str, Any]], lines: list[dict[str, Any]], tally: Tally
+) -> list[str]:
+    """The first record of the metrics that does not count the lines there were."""
+    counted = 0
+    for number, record in enumerate(records, start=1):
+        attempts = record.get("convert/attempts", -1)
+        if not counted <= attempts <= len(lines):
+            return [f"record {number}: convert/attempts is {attempts:g}"]
+        for line in lines[counted : int(attempts)]:
+            tally.count(line)
+        counted = int(attempts)
+        for key, value in tally.metrics(record["hours"]).items():
+            slack = SPEED_TOLERANCE if key == SPEED else 0.0
+            said = record.get(key, math.nan)
+            if not abs(said - value) <= slack * value + 1e-9:
+                text = f"record {number}: {key} is {said:g}, by the lines {value:g}"
+                return [text]
+    return []

@@ -318,3 +318,30 @@ def control_range(
             cap = sizes.ctrl_range_m if is_slide else sizes.ctrl_range_rad
             width[i] = min(width[i], cap)
     return width
+
+
+def simulate(
+    model: mujoco.MjModel, rollout: Rollout, *, single: bool = False
+) -> dict[str, np.ndarray]:
+    """States of the controls in MuJoCo C with the settings of the model, nothing more.
+
+    Args:
+        model: as stored, or built anew.
+        rollout: first state and controls.
+        single: begin every control step from the stored state before it.
+
+    Returns:
+        ``qpos`` (T, nq) and ``qvel`` (T, nv).
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = rollout.qpos0, rollout.qvel0
+    if rollout.act0 is not None and model.na:
+        data.act[:] = rollout.act0
+    out = {"qpos": np.empty_like(rollout.qpos), "qvel": np.empty_like(rollout.qvel)}
+    for t, row in enumerate(rollout.ctrl):
+        if single and t:
+            data.qpos[:], data.qvel[:] = rollout.qpos[t - 1], rollout.qvel[t - 1]
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, nstep=rollout.decimation)
+        out["qpos"][t], out["qvel"][t] = data.qpos, data.qvel
+    return out

@@ -18,13 +18,18 @@ import numpy as np
 from flashdex.errors import FlashdexError, RunError
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria import score, worst_movement
-from flashdex.metrics.criteria_table import Verdict
+from flashdex.metrics.criteria_table import (
+    Verdict,
+    make_criteria,
+    resolve_criterion,
+)
 from flashdex.metrics.errors import TrackingErrors, compute_tracking_errors
 from flashdex.system.archives import read_npz
 from flashdex.system.files import open_atomic
 from flashdex.system.names import check_name
 
 ROLLOUT_SCHEMA = 1
+REFERENCE = ("ref_object_pos", "ref_object_quat", "ref_fingertips", "ref_joints")
 MAX_BYTES = 256 << 20  # of the arrays of a file; a minute of two hands has 20 MB
 _WHOLE = ("hand_active", "hand_object", "object_qpos_adr", "object_qvel_adr")
 MAX_FPS, MAX_DECIMATION = 1000, 1000
@@ -329,3 +334,31 @@ def _check_shape(
             f"{where}: {key} has shape {shape}, expected ({symbols})"
             f"{' with ' + known if known else ''}. Store the rollout again."
         )
+
+
+def reference_sha256(rollout: Rollout) -> str:
+    """SHA-256 of the reference that a rollout was scored on."""
+    found = hashlib.sha256()
+    for name in REFERENCE:
+        value = np.ascontiguousarray(getattr(rollout, name), "<f8")
+        found.update(f"{name} {value.shape}".encode())
+        found.update(value.tobytes())
+    return found.hexdigest()
+
+
+def limits_of(rollout: Rollout) -> dict[str, Any]:
+    """Grace and limits of the criterion of a rollout, as this version has them."""
+    name = resolve_criterion(rollout.criterion)
+    for criterion in make_criteria(grace=rollout.grace):
+        if name in (criterion.name + s for s in ("", "_left", "_right")):
+            limits = {term.quantity: term.limit for term in criterion.terms}
+            return {"grace": criterion.grace, **limits}
+    raise AssertionError(name)
+
+
+def bindings_of(rollout: Rollout) -> dict[str, Any]:
+    """What the provenance of a rollout says of it."""
+    return {
+        "reference_sha256": reference_sha256(rollout),
+        "limits": limits_of(rollout),
+    }

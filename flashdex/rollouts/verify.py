@@ -9,20 +9,20 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.metrics.criteria import criterion_names, moves_too_little
+from flashdex.metrics.criteria import criterion_names, stays_behind
+from flashdex.metrics.tally import UNMOVED
 from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.findings import OLD, Finding, at, differences
+from flashdex.rollouts.claims import RunClaims, read_json
+from flashdex.rollouts.findings import OLD, Finding, differences
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
-    UNMOVED,
-    read_ledger,
     rollout_name,
 )
 from flashdex.rollouts.rollout import Rollout
@@ -31,15 +31,13 @@ from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_files
 from flashdex.system.names import file_stem
 from flashdex.system.run_files import (
+    MOTIONS,
     RECIPE,
     check_run,
-    read_metrics,
     read_recipe,
-    read_sessions,
 )
 
 CERTIFICATE = ".certificate.json"
-MAX_JSON = 16 << 20  # bytes of a certificate
 # of a line: what is counted from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
 RATIOS = ("lift_ratio", "path_ratio")
@@ -112,17 +110,12 @@ def verify_file(path: str | Path, truth: Truth | None = None) -> list[Finding]:
 class _RunCheck:
     def __init__(self, run_dir: Path, truth: Truth | None) -> None:
         self.run_dir, self.truth = run_dir, truth
-        self.findings: list[Finding] = []
-        self._baselines: dict[tuple[str, str], list[str]] | None = None
-
-    def fault(self, what: str, text: str, *, file: str = CONVERSIONS) -> None:
-        self.findings.append(Finding(file, what, text))
+        self.claims = RunClaims(run_dir)
 
     def run(self) -> Verified:
         check_run(self.run_dir)  # a link under the name of any file of a run
         files = own_files(self.run_dir, ROLLOUTS, "*.npz")
-        self._baselines = self._passing_baselines()
-        lines = self._lines()
+        lines = self.claims.lines()
         told = {x["motion"]: x for x in lines if x.get("rollout")}  # the newest
         if not files and not told:
             raise RunError(
@@ -132,92 +125,17 @@ class _RunCheck:
         names = {file.name for file in files}
         for motion in told:
             if Path(rollout_name(motion)).name not in names:
-                self.fault(motion, f"its {rollout_name(motion)} is missing")
+                self.claims.fault(motion, f"its {rollout_name(motion)} is missing")
         found = [self._one(file, told) for file in files]
         for path in own_files(self.run_dir, ROLLOUTS, f"*{CERTIFICATE}"):
             if path.name.removesuffix(CERTIFICATE) + ".npz" not in names:
-                self.fault("certificate", "of no rollout", file=self._name(path))
-        return Verified(found, self.findings)
+                self.claims.fault("certificate", "of no rollout", file=self._name(path))
+        if self.claims.is_bound:
+            found = [replace(one, findings=_too_old(one.findings)) for one in found]
+        return Verified(found, self.claims.findings)
 
     def _name(self, path: Path) -> str:
         return f"{ROLLOUTS}/{path.name}"
-
-    def _lines(self) -> list[dict[str, Any]]:
-        """Lines of the ledger; one that is not as it was written ends the list."""
-        try:
-            lines = read_ledger(own_file(self.run_dir, CONVERSIONS))
-        except FlashdexError as error:
-            self.fault("lines", str(error))
-            return []
-        attempts, wall_s = self._attempts(), 0.0
-        if len(lines) < attempts:
-            self.fault("lines", f"{len(lines)} are left of {attempts} attempts")
-        if len(lines) > attempts and self._is_over():
-            self.fault("lines", f"{len(lines)} of {attempts} attempts")
-        for number, line in enumerate(lines, start=1):
-            where = f"line {number}"
-            if line["wall_s"] < wall_s:
-                self.fault(where, "is out of order: its wall_s is below the one before")
-            wall_s = line["wall_s"]
-            self._line(where, line)
-        self._proofs(lines)
-        return lines
-
-    def _proofs(self, lines: list[dict[str, Any]]) -> None:
-        """A motion is converted by the line that stores its first pass."""
-        kept: set[tuple[str, str]] = set()
-        for number, line in enumerate(lines, start=1):
-            key = (line["motion"], line["criterion"])
-            if line.get("rollout"):
-                kept.add(key)
-            elif line.get("certified") or line.get("verdict"):
-                self.fault(f"line {number}", "is certified, but names no rollout")
-            elif line["converted"] and key not in kept:
-                text = "is the motion's first conversion, but names no rollout"
-                self.fault(f"line {number}", text)
-
-    def _attempts(self) -> int:
-        """Attempts that the last record of the metrics counts."""
-        try:
-            records = read_metrics(self.run_dir)
-            return int(records[-1].get("convert/attempts", 0)) if records else 0
-        except (RunError, TypeError, ValueError) as error:
-            self.fault("metrics", str(error), file="metrics.jsonl")
-            return 0
-
-    def _passing_baselines(self) -> dict[tuple[str, str], list[str]] | None:
-        """Baselines by motion and criterion that they pass; None: not comparable."""
-        path = own_file(self.run_dir, "baselines.json")
-        # an override scores them anew, for the lines from then on
-        if not path.is_file() or self._was_overridden():
-            return None
-        rows, fault = _read_json(path)
-        if fault:
-            self.fault("file", fault, file=path.name)
-            return None
-        found: dict[tuple[str, str], list[str]] = {}
-        for name, motions in rows.items():
-            for motion in motions if isinstance(motions, dict) else ():
-                for criterion in at(motions, motion, "passed") or ():
-                    found.setdefault((motion, criterion), []).append(name)
-        return found
-
-    def _line(self, where: str, line: dict[str, Any]) -> None:
-        """What one line says of itself."""
-        named = line.get("rollout")
-        if named and named != rollout_name(line["motion"]):
-            self.fault(where, f"names {named!a}, not the rollout of its motion")
-        if line.get("gpu_s", 0.0) not in (0.0, line["wall_s"]):
-            self.fault(where, f"gpu_s is {line['gpu_s']}, wall_s {line['wall_s']}")
-        if line["converted"] != (line["criterion"] in line.get("passed", [])):
-            self.fault(where, "converted is not what the passed criteria say")
-        if self._baselines is not None and "trivial" in line:
-            expected = self._baselines.get((line["motion"], line["criterion"]), [])
-            if [b for b in line["trivial"] if b != UNMOVED] != expected:
-                text = f"trivial is {line['trivial']}, by the baselines {expected}"
-                self.fault(where, text)
-        if named and not line["converted"]:
-            self.fault(where, "names a rollout of an attempt that did not pass")
 
     def _one(self, path: Path, told: dict[str, dict[str, Any]]) -> Replayed:
         file = self._name(path)
@@ -253,10 +171,14 @@ class _RunCheck:
         if "recipe_sha256" in said and (self.run_dir / RECIPE).exists():
             sha = self._recipe_sha256()
             if said["recipe_sha256"] != sha:
-                changed = self._was_overridden()
+                changed = self.claims.was_overridden()
                 text = "recipe.yaml is another than it was made by"
                 text += ", as --resume changed it" if changed else ""
                 found.append(Finding(file, "recipe", text, is_fault=not changed))
+        known = self.claims.motions.get(rollout.motion)
+        if self.claims.motions and said.get("motion_sha256", known) != known:
+            text = f"the motion is another than that of {MOTIONS}"
+            found.append(Finding(file, "motion", text))
         if self.truth is None:
             return found
         library = self.truth.library
@@ -280,23 +202,6 @@ class _RunCheck:
             return ""  # of no recipe
         return hashlib.sha256(recipe.encode()).hexdigest()
 
-    def _was_overridden(self) -> bool:
-        """A later session than the first was given other values."""
-        starts = [x for x in self._sessions() if x.get("event") == "start"]
-        return any(session.get("overrides") for session in starts[1:])
-
-    def _is_over(self) -> bool:
-        """The last session ended in order, and so counted all its attempts."""
-        last = self._sessions()[-1:]
-        ended = any(x.get("event") == "end" and x.get("why") != "error" for x in last)
-        return ended and not self._was_overridden()
-
-    def _sessions(self) -> list[dict[str, Any]]:
-        try:
-            return read_sessions(self.run_dir)
-        except RunError:
-            return []
-
     def _certificate(
         self, path: Path, rollout: Rollout, check: RolloutCheck
     ) -> tuple[str, dict[str, Any], list[Finding]]:
@@ -305,7 +210,7 @@ class _RunCheck:
         name, stored = self._name(file), {}
         found: list[Finding] = []
         if file.is_file():
-            stored, fault = _read_json(file)
+            stored, fault = read_json(file)
             found += [Finding(name, "file", fault)] if fault else []
         if check.model is None or faults(check.findings):
             # it is not what it says; what a replay of it would prove is nothing
@@ -339,9 +244,15 @@ class _RunCheck:
         pairs += [(key, line.get(key), expected[key]) for key in RATIOS if new]
         if new:
             has = UNMOVED in (line.get("trivial") or [])
-            unmoved = moves_too_little({k[:4]: expected[k] for k in RATIOS})
+            unmoved = stays_behind(rollout.tracking_errors())
             pairs.append((f"trivial.{UNMOVED}", has, unmoved))
         pairs.append(("seed", line.get("seed"), rollout.seed))
+        if self.claims.is_bound:
+            passed = (_without_end(x.get("passed", [])) for x in (line, expected))
+            pairs.append(("passed", *passed))
+            made_by = json.loads(rollout.versions).get("engine")
+            pairs.append(("engine", line.get("engine"), made_by))
+            pairs.append(("criterion", line["criterion"], rollout.criterion))
         pairs.append(("verdict", line.get("verdict"), stored.get("verdict")))
         is_proven = stored.get("verdict") in PROVEN if stored else None
         if "verdict" in line or stored:
@@ -362,15 +273,17 @@ class _RunCheck:
         ]
 
 
-def _read_json(file: Path) -> tuple[dict[str, Any], str]:
-    """A JSON object, or why it is none."""
-    try:
-        if file.stat().st_size > MAX_JSON:
-            return {}, f"{file.stat().st_size} bytes are no certificate"
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        return {}, f"is no JSON ({error})"
-    return (found, "") if isinstance(found, dict) else ({}, "is no JSON object")
+def _without_end(passed: list[Any]) -> list[Any]:
+    """Criteria but that of terminations, which a file does not hold."""
+    return [name for name in passed if not str(name).startswith("completed")]
+
+
+def _too_old(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Those of a run that has an id: what it does not bind was taken out of it."""
+    text = "is not bound, in a run of a version that binds it"
+    return tuple(
+        replace(f, text=text, is_fault=True) if f.text == OLD else f for f in findings
+    )
 
 
 def faults(findings: Iterable[Finding]) -> list[Finding]:

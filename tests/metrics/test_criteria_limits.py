@@ -11,6 +11,7 @@ from flashdex.metrics.criteria import (
     moves_too_little,
     resolve_criterion,
     score,
+    stays_behind,
     worst_movement,
 )
 from flashdex.metrics.errors import TrackingErrors
@@ -163,3 +164,34 @@ def test_an_object_has_to_rise_as_its_reference_does(rise, state):
     ratio = worst_movement(moved)["lift"]
     assert ratio == pytest.approx(max(rise, 0.0))
     assert moves_too_little(worst_movement(moved)) == (rise < 0.8)
+
+
+def _shaken(way):
+    return 0.012 * torch.sin(40 * torch.linspace(0, 1, len(way)))[:, None] * Y
+
+
+Y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+# reference: 4 cm along x in the middle third
+CHEATS = {
+    "still": lambda way: way * 0,
+    "trembles": _shaken,
+    "the other way": lambda way: -way,
+    "across": lambda way: way[:, [1, 0, 2]],
+    "at the very end": lambda way: way * (torch.arange(len(way)) > T - 4)[:, None],
+    "a third of it": lambda way: way / 3,
+}
+
+
+@pytest.mark.parametrize("cheat", CHEATS)
+@pytest.mark.parametrize("other", [1.0, 5.0], ids=["good", "overdone"])
+def test_an_object_that_goes_elsewhere_stays_behind(cheat, other):
+    """Also one of two, whatever the other does."""
+    ref = torch.zeros(T, 2, 3, dtype=torch.float64)
+    ref[:, :, 0] = 0.04 * (torch.linspace(-1, 2, T).clamp(0, 1))[:, None]
+    way = ref[:, 1]
+    offset = torch.zeros_like(ref)
+    offset[:, 0] = way * (other - 1)
+    given = replace(signals(), ref_object_pos=ref, object_pos_offset=offset)
+    assert not stays_behind(given)
+    offset[:, 1] = CHEATS[cheat](way) - way
+    assert stays_behind(replace(given, object_pos_offset=offset))

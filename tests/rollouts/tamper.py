@@ -10,10 +10,9 @@ import numpy as np
 
 from flashdex.errors import RunError
 from flashdex.metrics.criteria_table import resolve_criterion
-from flashdex.rollouts.bindings import bindings_of
 from flashdex.rollouts.certificate import certify
 from flashdex.rollouts.ledger import CONVERSIONS
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout, bindings_of
 from flashdex.rollouts.verify import verify_file
 from flashdex.system.arrays import hash_content
 from flashdex.system.jsonl import read_lines, write_lines

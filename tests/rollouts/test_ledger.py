@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -227,6 +228,21 @@ def test_an_object_that_hardly_moves_is_trivial_until_it_moves(
     assert (stored.object_pos == passing.object_pos).all()
     for again in (ledger, open_ledger(tmp_path, library)):
         assert (again.num_converted, again.num_trivial) == (1, 0)
+
+
+def test_a_proof_without_movement_proves_no_movement(
+    tmp_path, library, passing, monkeypatch
+):
+    made = SimpleNamespace(save=lambda path: path.write_text("{}"), verdict="failed")
+    monkeypatch.setattr("flashdex.rollouts.ledger.certify", lambda *_, **__: made)
+    still = copy.deepcopy(passing)
+    still.object_pos[:] = still.object_pos[:1]
+    ledger = open_ledger(tmp_path, library, certify=True)
+    record(ledger, passing, env_steps=10, wall_s=2.0)
+    made.verdict = "robust"
+    record(ledger, still, env_steps=20, wall_s=3.0)
+    assert "rollout" not in read_lines(tmp_path / CONVERSIONS)[-1]
+    assert ledger.note == "1 of 3 converted, 0 certified"
 
 
 @pytest.mark.parametrize("name", ["../evil", "/evil", "", "a\0b", "a\nb", "x" * 300, 7])

@@ -14,7 +14,7 @@ from flashdex.errors import RunError
 from flashdex.rollouts.findings import differences
 from flashdex.rollouts.ledger import CONVERSIONS
 from flashdex.rollouts.verify import verify_run
-from flashdex.system.jsonl import read_lines, write_lines
+from flashdex.system.jsonl import read_lines, read_object, write_lines, write_object
 
 
 def test_an_untouched_run_holds_and_everything_is_checked(converted_run, truth):
@@ -244,6 +244,11 @@ def test_a_run_of_an_older_version_holds_and_says_what_is_not_bound(spoilt_run):
     (spoilt_run / CONVERSIONS).write_text(
         "".join(json.dumps(line) + "\n" for line in text)
     )
+    # in a run that has an id it was taken out
+    assert not verify_run(spoilt_run).holds
+    versions = read_object(spoilt_run, "versions.json")
+    del versions["run"]
+    write_object(versions, spoilt_run, "versions.json")
     verified = verify_run(spoilt_run)
     assert verified.holds
     assert any("older version" in str(finding) for finding in verified.findings)

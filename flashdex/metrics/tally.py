@@ -1,0 +1,118 @@
+"""What the lines of a ledger come to: conversions, proofs, and what is trivial."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
+
+Line = dict[str, Any]
+
+
+def is_trivial(line: Line) -> bool:
+    """A conversion that needed no learning, or in which the object hardly moved."""
+    return bool(line.get("trivial"))
+
+
+def is_unmoved(line: Line) -> bool:
+    """A pass in which an object stays behind its reference."""
+    return UNMOVED in (line.get("trivial") or ())
+
+
+class Tally:
+    """Counts of attempts, from their lines.
+
+    Args:
+        names: of the motions of the run.
+        criterion: of the run; lines of another one do not count.
+        lines: to count, oldest first.
+    """
+
+    def __init__(
+        self, names: Iterable[str], criterion: str, lines: Iterable[Line] = ()
+    ) -> None:
+        self.names, self.criterion = list(names), criterion
+        # motion -> line of its first pass, with the newest verdict
+        self.conversions: dict[str, Line] = {}
+        self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
+        # motion -> lines
+        self.attempts: dict[str, int] = dict.fromkeys(self.names, 0)
+        for line in lines:  # a resume may ask for another criterion, or fewer motions
+            if line["criterion"] == criterion and line["motion"] in self.attempts:
+                self.count(line)
+
+    def count(self, line: Line) -> bool:
+        """Count a line that is in the file; is it the motion's first that passes?"""
+        name = line["motion"]
+        self.attempts[name] = self.attempts.get(name, 0) + 1
+        self.last[name] = line["converted"]
+        before = self.conversions.get(name)
+        if before is None or self.moves_more(line, before):
+            if line["converted"]:
+                self.conversions[name] = dict(line)
+        elif line.get("verdict") is not None and not self.moves_more(before, line):
+            newest = {key: line.get(key) for key in ("certified", "verdict")}
+            before.update(newest)
+        return before is None and line["converted"]
+
+    @staticmethod
+    def moves_more(line: Line, before: Line) -> bool:
+        """A pass in which the object moves, against one in which it hardly did."""
+        return is_unmoved(before) and not is_unmoved(line)
+
+    @property
+    def note(self) -> str:
+        """What was achieved, in a few words: what is not trivial first."""
+        text = f"{self.num_converted} of {len(self.names)} converted"
+        if self.num_converted:
+            text += f", {self.num_certified} certified"
+        return f"{text}, and {self.num_trivial} trivial" if self.num_trivial else text
+
+    @property
+    def num_attempts(self) -> int:
+        """Attempts of all motions."""
+        return sum(self.attempts.values())
+
+    @property
+    def num_passed(self) -> int:
+        """Motions with at least one passing attempt, trivial ones too."""
+        return len(self.conversions)
+
+    @property
+    def _earned(self) -> list[Line]:
+        return [c for c in self.conversions.values() if not is_trivial(c)]
+
+    @property
+    def num_converted(self) -> int:
+        """Motions with a passing attempt that is not trivial."""
+        return len(self._earned)
+
+    @property
+    def num_trivial(self) -> int:
+        """Motions whose passing attempt is trivial."""
+        return self.num_passed - self.num_converted
+
+    @property
+    def num_certified(self) -> int:
+        """Converted motions, not trivial, whose certificate holds."""
+        return sum(bool(c["certified"]) for c in self._earned)
+
+    def metrics(self, hours: float) -> dict[str, float]:
+        """Counters of the ``convert/`` group after so many hours of wall time."""
+        total = len(self.names)
+        passing = sum(self.last.get(n, False) for n in self.names)
+        every = self.conversions.values()
+        out = {
+            "convert/nontrivial": float(self.num_converted),
+            "convert/trivial": float(self.num_trivial),
+            "convert/cumulative": float(self.num_passed),
+            "convert/rate": self.num_passed / total,
+            "convert/last": passing / total,
+            "convert/certified": float(sum(bool(c["certified"]) for c in every)),
+            "convert/robust": float(sum(c.get("verdict") == "robust" for c in every)),
+            "convert/attempts": float(self.num_attempts),
+        }
+        if hours > 0:
+            out["convert/per_hour"] = self.num_passed / hours
+        return out

@@ -102,17 +102,17 @@ class Tally:
         """Counters of the ``convert/`` group after so many hours of wall time."""
         total = len(self.names)
         passing = sum(self.last.get(n, False) for n in self.names)
-        every = self.conversions.values()
+        robust = sum(c.get("verdict") == "robust" for c in self._earned)
         out = {
             "convert/nontrivial": float(self.num_converted),
             "convert/trivial": float(self.num_trivial),
             "convert/cumulative": float(self.num_passed),
             "convert/rate": self.num_passed / total,
             "convert/last": passing / total,
-            "convert/certified": float(sum(bool(c["certified"]) for c in every)),
-            "convert/robust": float(sum(c.get("verdict") == "robust" for c in every)),
+            "convert/certified": float(self.num_certified),
+            "convert/robust": float(robust),
             "convert/attempts": float(self.num_attempts),
         }
         if hours > 0:
-            out["convert/per_hour"] = self.num_passed / hours
+            out["convert/per_hour"] = self.num_converted / hours
         return out

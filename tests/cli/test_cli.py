@@ -35,7 +35,7 @@ def test_ls_shows_every_recipe_and_its_promise(run):
     assert code == 0
     for path in (ROOT / "recipes").glob("*.yaml"):
         assert path.stem in out
-    assert "convert/cumulative >= 40 at 300,000,000 env steps" in out
+    assert "convert/nontrivial >= 40 at 300,000,000 env steps" in out
 
 
 def test_a_user_error_is_two_and_goes_to_stderr(run):

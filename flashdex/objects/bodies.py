@@ -50,9 +50,10 @@ def orient_bodies(mesh: trimesh.Trimesh) -> None:
     order = np.flatnonzero(closed)[np.argsort(-np.abs(volume[closed]), kind="stable")]
     wanted = np.zeros(len(closed))  # sense of each body; 0 for what is dropped
     around: list[int] = []
+    is_sought = len(order) <= MAX_NESTED  # each pair costs a look at all triangles
     for body in order:
-        inside = [b for b in around if _holds(mesh, label, b, body)]
-        parent = inside[-1] if inside and len(order) <= MAX_NESTED else None
+        inside = [b for b in around if is_sought and _holds(mesh, label, b, body)]
+        parent = inside[-1] if inside else None
         if parent is None:
             wanted[body] = 1.0
         elif np.sign(volume[body]) != np.sign(volume[parent]):

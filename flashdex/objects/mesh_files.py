@@ -20,8 +20,14 @@ import trimesh
 # others of trimesh unpack archives, or read what they name from other files
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
 MAX_FACES = 5_000_000  # a scene may hold the same geometry any number of times
-MAX_FILE = 1 << 30  # bytes
+MAX_REPEATED = 500_000  # as small as the file may be, cleaning takes its time
+MAX_FILE = 1 << 29  # bytes; text takes three times as much while it is parsed
 MAX_NODES, MAX_DEPTH = 10_000, 64  # of a scene
+MAX_GROUPS = 1000  # of triangles, each a mesh of its own; time grows with the square
+# bytes of an entry, at most; what a glb unpacks to below MIN_GROWTH is let pass
+GLB_BYTES = {"SCALAR": 4, "VEC2": 8, "VEC3": 12, "VEC4": 16, "MAT2": 16, "MAT3": 36}
+MIN_GROWTH = 256 << 20
+MATERIAL = re.compile(rb"usemtl[^\r\n]*")
 PLY_HEAD = 1 << 16  # bytes
 PLY_ELEMENT = re.compile(rb"^\s*element\s+\S+\s+(\S+)\s*$", re.MULTILINE)
 
@@ -44,6 +50,10 @@ def read_scene(path: Path) -> trimesh.Scene:
         _check_ply(data)
     elif kind == "glb":
         _check_glb(data)
+    elif kind == "obj" and data.count(b"usemtl") > MAX_GROUPS:
+        data = MATERIAL.sub(b"", data)
+    elif kind == "stl" and data.count(b"endsolid") > MAX_GROUPS:
+        raise ValueError(f"more than {MAX_GROUPS} solids; join them to one")
     scene = trimesh.load_scene(
         io.BytesIO(data), file_type=kind, process=False, skip_materials=True
     )
@@ -51,6 +61,9 @@ def read_scene(path: Path) -> trimesh.Scene:
     faces = sum(len(getattr(scene.geometry[s], "faces", ())) for s in shapes)
     if faces > MAX_FACES:
         raise ValueError(f"{faces} triangles; at most {MAX_FACES}")
+    if len(shapes) > len(set(shapes)) and faces > MAX_REPEATED:
+        text = f"{faces} triangles by repeating parts; at most {MAX_REPEATED}"
+        raise ValueError(text)
     return scene
 
 
@@ -68,10 +81,15 @@ def _check_glb(data: bytes) -> None:
     scene = json.loads(data[20 : 20 + length])
     if any("uri" in buffer for buffer in scene.get("buffers", [])):
         raise ValueError("its numbers are in another file")
+    total = 0
     for accessor in scene.get("accessors", []):
+        total += int(accessor["count"]) * GLB_BYTES.get(accessor["type"], 64)
         # without a view it is filled with zeros, as many as it says
         if "bufferView" not in accessor and int(accessor["count"]) * 16 > len(data):
             raise ValueError(f"{accessor['count']} numbers announced and none there")
+    # views may overlap, and be walked through in steps shorter than what is read
+    if total > max(4 * len(data), MIN_GROWTH):
+        raise ValueError(f"{total} bytes announced in {len(data)}")
     _check_nodes(scene.get("nodes", []))
 
 

@@ -136,6 +136,14 @@ def test_announced_shapes_are_not_allocated(tmp_path, shape, dtype):
             load_npz(zipped(tmp_path / "a.npz", {"a.npy": data}), plain=plain)
 
 
+def test_header_too_deep_for_the_parser_is_one_message(tmp_path):
+    text = b"{'descr':'<f8','fortran_order':False,'shape':(" + b"-" * 9000 + b"1,)}\n"
+    head = b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text
+    (tmp_path / "a.npy").write_bytes(head)
+    with pytest.raises(DemoError, match="nested too deep"):
+        load_npy(tmp_path / "a.npy")
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -210,6 +218,9 @@ def test_pickle_of_the_same_parts_does_not_grow(tmp_path, bomb):
         pytest.param(b"\x80\x04\x8b\xff\xff\xff\x7f1.", id="long_length"),
         pytest.param(b"\x80\x04\x8b\xff\xff\xff\xff1.", id="negative_length"),
         pytest.param(b"\x80\x04\x95" + b"\xff" * 8 + b".", id="frame"),
+        pytest.param(
+            pickle.dumps({i * (2**61 - 1): 0 for i in range(99)}), id="one_hash"
+        ),
         pytest.param(b"\x80\xff.", id="protocol"),
         pytest.param(b"0" * 10**6, id="pops"),
         pytest.param(b"g999\n.", id="memo_that_is_not_there"),

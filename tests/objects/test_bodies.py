@@ -1,5 +1,7 @@
 """Bodies of a mesh: whichever way round a file has them, the mass is the right one."""
 
+import time
+
 import numpy as np
 import pytest
 import trimesh
@@ -77,6 +79,17 @@ def test_volume_and_centre_do_not_depend_on_the_sense_of_bodies(mesh, volume):
     low, high = clean.bounds
     assert ((clean.center_mass > low) & (clean.center_mass < high)).all()
     assert np.linalg.eigvalsh(clean.moment_inertia)[0] > 0
+
+
+def test_nesting_is_not_sought_among_thousands():
+    grid = np.stack(np.meshgrid(*[np.arange(14.0)] * 3), -1).reshape(-1, 3)
+    cube = trimesh.creation.box([0.002] * 3)
+    many = trimesh.util.concatenate(
+        [cube.copy().apply_translation(p / 200) for p in grid]
+    )
+    start = time.process_time()
+    assert clean_mesh(many, name="many").volume == pytest.approx(len(grid) * 8e-9)
+    assert time.process_time() - start < 10
 
 
 @pytest.mark.parametrize("mesh", [tool(head=True), tool(handle=True)])

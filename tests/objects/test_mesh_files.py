@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+import time
 import tracemalloc
 
 import numpy as np
@@ -58,6 +59,14 @@ def crowd(scene):
     scene["scenes"] = [{"nodes": list(range(20_000))}]
 
 
+def short_steps(scene):
+    view = {**scene["bufferViews"][0], "byteStride": 1}
+    scene["bufferViews"].append(view)
+    odd = {"bufferView": len(scene["bufferViews"]) - 1, "type": "MAT4"}
+    odd |= {"componentType": 5126, "count": 5_000_000}
+    scene["accessors"] += [odd]
+
+
 def elsewhere(scene):
     scene["buffers"] = [{"uri": "secret.bin", "byteLength": 8}]
 
@@ -92,6 +101,7 @@ HOSTILE = {
     "glb_circle": ("a.glb", glb(circle)),
     "glb_deep": ("a.glb", glb(deep)),
     "glb_crowd": ("a.glb", glb(crowd)),
+    "glb_short_steps": ("a.glb", glb(short_steps)),
     "glb_other_file": ("a.glb", glb(elsewhere)),
     "glb_deep_json": ("a.glb", pack(b"[" * 100_000)),
     "glb_short": ("a.glb", b"glTF\2\0\0\0"),
@@ -109,6 +119,33 @@ def test_hostile_mesh_is_refused_and_costs_nothing(tmp_path, name, content):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
+
+
+def test_repeated_parts_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_files, "MAX_REPEATED", 100)
+
+    def place(scene):
+        scene["nodes"] = [{"mesh": 0}] * 9
+        scene["scenes"] = [{"nodes": list(range(9))}]
+
+    (tmp_path / "a.glb").write_bytes(glb(place))
+    with pytest.raises(MeshError, match="108 triangles by repeating"):
+        load_mesh(tmp_path / "a.glb")
+
+
+def test_groups_by_material_cost_no_time(tmp_path):
+    triangle = " usemtl m{}\nf 1 2 3\n"
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(map(triangle.format, range(20_000)))
+    (tmp_path / "a.obj").write_text(text)
+    start = time.process_time()
+    assert len(load_mesh(tmp_path / "a.obj").faces) == 20_000
+    assert time.process_time() - start < 5
+
+
+def test_many_solids_are_refused(tmp_path):
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n" * 2000)
+    with pytest.raises(MeshError, match="1000 solids"):
+        load_mesh(tmp_path / "a.stl")
 
 
 def test_large_file_is_not_read(tmp_path, monkeypatch):

@@ -118,7 +118,8 @@ def _motion_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
         yield f"motions/hand_active: motion {row} has no hand"
     discs = arrays["motions/support_disks"]
     is_free = np.asarray(np.isnan(discs).all(-1))
-    is_disc = np.asarray((np.abs(discs) <= 100).all(-1) & (discs[..., 3:] > 0).all(-1))
+    is_thick = (discs[..., 3:] >= MIN_THICKNESS).all(-1)
+    is_disc = np.asarray((np.abs(discs) <= 100).all(-1) & is_thick)
     is_late = is_disc[:, 1:] & is_free[:, :-1]  # the used ones come first
     for row in np.flatnonzero((~(is_free | is_disc)).any(-1) | is_late.any(-1)):
         yield f"motions/support_disks: those of motion {row} are no discs"

@@ -120,6 +120,7 @@ NUMBERS = {
     "no-hand": put("motions/hand_active", 0, False),
     "disc-partly-nan": put("motions/support_disks", (0, 0, 2), np.nan),
     "disc-of-no-radius": put("motions/support_disks", (0, 0, 3), 0.0),
+    "disc-of-hardly-any": put("motions/support_disks", (0, 0, 3), 1e-45),
     "disc-after-a-gap": put("motions/support_disks", (0, 2), [0, 0, 0, 0.5, 0.02]),
     "disc-infinite": put("motions/support_disks", (0, 0, 0), np.inf),
 }

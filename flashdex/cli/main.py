@@ -53,6 +53,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `flashdex ls | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (OSError, MemoryError) as error:
+        if args.debug:
+            raise
+        told = str(error) or "no memory is left"
+        say(f"flashdex {args.verb}: disk or memory failed: {told}", error=True)
+        return 2
 
 
 def _set_up_logging(*, debug: bool) -> None:

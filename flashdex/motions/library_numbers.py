@@ -28,6 +28,7 @@ QUAT_SLACK = 1e-3  # of a norm from 1
 BOX_SLACK = 0.1  # of a box's longest side, that a mesh and its parts may differ by
 MAX_VERTICES = 10_000  # of a convex part; a hull of more takes for ever
 MIN_THICKNESS = 1e-6  # m; the simulation knows no flat bodies
+MIN_INERTIA = 1e-12  # kg m2; MuJoCo takes less than 1e-14 for none
 
 
 def find_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
@@ -118,7 +119,8 @@ def _motion_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
         yield f"motions/hand_active: motion {row} has no hand"
     discs = arrays["motions/support_disks"]
     is_free = np.asarray(np.isnan(discs).all(-1))
-    is_disc = np.asarray((np.abs(discs) <= 100).all(-1) & (discs[..., 3:] > 0).all(-1))
+    is_thick = (discs[..., 3:] >= MIN_THICKNESS).all(-1)
+    is_disc = np.asarray((np.abs(discs) <= 100).all(-1) & is_thick)
     is_late = is_disc[:, 1:] & is_free[:, :-1]  # the used ones come first
     for row in np.flatnonzero((~(is_free | is_disc)).any(-1) | is_late.any(-1)):
         yield f"motions/support_disks: those of motion {row} are no discs"
@@ -137,6 +139,10 @@ def _body_faults(body: Mapping[str, np.ndarray]) -> Iterator[str]:
     points = body["points"]
     if ((points < low - slack) | (points > high + slack)).any():
         yield "its surface points lie outside of its box"
+    origin, nodes = body["sdf_origin"].astype(np.float64), np.array(body["sdf"].shape)
+    far = origin + float(body["sdf_spacing"]) * (nodes - 1)
+    if ((origin > low + slack) | (far < high - slack)).any():
+        yield "its distance grid does not cover its box"
     radius = float(np.linalg.norm(points, axis=-1).max())
     told = float(body["radius"])
     if abs(radius - told) > 1e-3 * radius:
@@ -145,7 +151,7 @@ def _body_faults(body: Mapping[str, np.ndarray]) -> Iterator[str]:
         yield f"its centre of mass {com.tolist()} lies outside of its box"
     main = np.linalg.eigvalsh((inertia + inertia.T) / 2)
     scale = np.abs(inertia).max()
-    if np.abs(inertia - inertia.T).max() > 1e-3 * scale or main[0] <= 0:
+    if np.abs(inertia - inertia.T).max() > 1e-3 * scale or main[0] < MIN_INERTIA:
         yield "its inertia is not symmetric and positive"
     elif main[0] + main[1] < main[2] * (1 - 1e-3):
         yield "its inertia is that of no body: two of three moments are below the third"

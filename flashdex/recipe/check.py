@@ -199,7 +199,8 @@ def _explain(cls: type, error: Any, path: str) -> tuple[str, str]:
         what = "argument" if path.startswith("env.") else "key"
         return where, _unknown(what, way[-1], known)
     if kind == "literal_error":
-        known = re.findall(r"'([^']*)'", limits["expected"])
+        known = re.findall(r"'([^']*)'|\b(\d+)\b", limits["expected"])
+        known = [text or digits for text, digits in known]
         problem = f"{_shown(value)} is not allowed.{nearest(str(value)[:99], known)} "
         return where, f"{item}{problem}Allowed: {', '.join(known)}."
     for key in _RANGES.keys() & limits:

@@ -248,8 +248,8 @@ class _RunCheck:
             pairs.append((f"trivial.{UNMOVED}", has, unmoved))
         pairs.append(("seed", line.get("seed"), rollout.seed))
         if self.claims.is_bound:
-            passed = (_without_end(x.get("passed", [])) for x in (line, expected))
-            pairs.append(("passed", *passed))
+            said, found = (_without_end(x.get("passed", [])) for x in (line, expected))
+            pairs.append(("passed", said, found))
             made_by = json.loads(rollout.versions).get("engine")
             pairs.append(("engine", line.get("engine"), made_by))
             pairs.append(("criterion", line["criterion"], rollout.criterion))

@@ -121,6 +121,10 @@ def hash_content(path: Path) -> str:
     """SHA-256 of a file, read now."""
     digest = hashlib.sha256()
     with open_plain(path) as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+        try:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        except OSError as error:
+            error.filename = str(path)  # reading alone does not say of what
+            raise
     return digest.hexdigest()

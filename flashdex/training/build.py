@@ -206,6 +206,12 @@ class RunBuilder:
                 f"{library.path}: prepared for hand '{library.hand}', the recipe asks "
                 f"for '{recipe.hand}'. Prepare it again with --hand {recipe.hand}."
             )
+        if (library.motions["object_index"] < 0).all():
+            raise LibraryError(
+                f"{library.path}: no motion has an object, so there is nothing to "
+                "follow. Prepare recordings in which an object is held, or select "
+                "others with motions.select."
+            )
         _check_joints(library, hands)
         step_dt = recipe.physics.timestep * recipe.physics.decimation
         if not math.isclose(library.fps * step_dt, 1.0, rel_tol=1e-3):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tomllib
 from pathlib import Path
@@ -76,6 +77,27 @@ def test_mistakes_exit_two(run, argv, expected):
     code, _, err = run(*argv)
     assert code == 2
     assert expected in err
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.EIO, "Input/output error", "runs/a"), "error: 'runs/a'"),
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left"),
+        (MemoryError(), "no memory is left"),
+    ],
+)
+def test_a_machine_that_fails_is_told_in_one_line(run, monkeypatch, error, told):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("flashdex.recipe.compose", fail)
+    code, out, err = run("baselines", "quickstart")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("flashdex baselines: disk or memory failed: ")
+    assert told in err
+    with pytest.raises(type(error)):
+        main(["baselines", "quickstart", "--debug"])
 
 
 def test_cfg_prints_a_complete_recipe_for_each_run(run):

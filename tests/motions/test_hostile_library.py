@@ -97,6 +97,9 @@ NUMBERS = {
     "mass-tonnes": put("objects/mass", 0, 1e4),
     "mass-tiny": scale("objects/mass", 1e-3),
     "inertia-zero": put("objects/inertia", 0, 0.0),
+    "inertia-of-a-speck": scale("objects/inertia", 1e-12),
+    "grid-too-small": scale("objects/sdf_spacing", 1e-3),
+    "grid-elsewhere": put("objects/sdf_origin", 0, 0.05),
     "inertia-negative": scale("objects/inertia", -1),
     "inertia-of-no-body": put("objects/inertia", (0, 0, 0), 1e-2),
     "inertia-not-symmetric": put("objects/inertia", (0, 0, 1), 5e-5),
@@ -120,6 +123,7 @@ NUMBERS = {
     "no-hand": put("motions/hand_active", 0, False),
     "disc-partly-nan": put("motions/support_disks", (0, 0, 2), np.nan),
     "disc-of-no-radius": put("motions/support_disks", (0, 0, 3), 0.0),
+    "disc-of-hardly-any": put("motions/support_disks", (0, 0, 3), 1e-45),
     "disc-after-a-gap": put("motions/support_disks", (0, 2), [0, 0, 0, 0.5, 0.02]),
     "disc-infinite": put("motions/support_disks", (0, 0, 0), np.inf),
 }

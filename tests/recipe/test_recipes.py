@@ -112,6 +112,7 @@ def test_five_mistakes_are_reported_at_once(write_recipe):
         ("expect=[{metric: a}]", "expect[0].at_env_steps: missing; every recipe must"),
         ("hand=xhnad", "Did you mean 'xhand'?"),
         ("physics.engine=gpu", "physics.engine: 'gpu' is not allowed"),
+        ("physics.condim=5", "physics.condim: 5 is not allowed. Allowed: 3, 4, 6."),
         ("~env.transforms.contacts", "Did you mean 'contact'?"),
         ("env.rewards.object_points.sigma=0", "must be greater than 0"),
         ("seed=0,1", "-m"),

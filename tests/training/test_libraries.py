@@ -42,6 +42,11 @@ def bent_too_far(entries, arrays):
     arrays["frames/joint_pos"][60, 0, 8] = 9.0
 
 
+def without_objects(entries, arrays):
+    arrays["motions/object_index"][:] = -1
+    arrays["motions/hand_object"][:] = -1
+
+
 def bent_by_an_idle_hand(entries, arrays):
     arrays["frames/joint_pos"][:40, 0, 8] = 9.0  # motion 0 is of the right hand
 
@@ -51,9 +56,10 @@ def bent_by_an_idle_hand(entries, arrays):
     [
         (without_a_joint, "has 17 joints of 'xhand', the hand has 18"),
         (bent_too_far, "motion 'left_ball' bends 'left_.*' beyond its range"),
+        (without_objects, "no motion has an object"),
     ],
 )
-def test_references_of_another_hand_are_refused(copy, change, text):
+def test_references_that_no_run_can_use_are_refused(copy, change, text):
     forge_library(copy, change)
     with pytest.raises(LibraryError, match=text):
         RunBuilder.from_recipe(recipe_of(library=str(copy)))

@@ -30,8 +30,9 @@ class PhysicsConfig:
     """Sliding friction of object geoms; the larger of a pair counts."""
     support_friction: float = number(1.0, low=0, high=100)
     """Sliding friction of supports; the larger of a pair counts."""
-    condim: int = number(4, low=3, high=6)
-    """Contact dimensions of objects: 3 = sliding, 4 adds torsion at the fingertip."""
+    condim: Literal[3, 4, 6] = 4
+    """Contact dimensions of objects: 3 = sliding, 4 adds torsion at the fingertip, 6
+    rolling."""
     impratio: float = number(10.0, above=0, high=1e4)
     """Friction over normal constraint stiffness; larger slips less."""
     support_disks: bool = True

@@ -293,6 +293,9 @@ def _show_run(run_dir: Path) -> bool:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
+    from flashdex.system.run_files import require_run
+
+    require_run(args.run_dir)  # before anything large is loaded
     with loading():
         from flashdex.reports.run.terminal import evaluation_table
         from flashdex.training.run_dir import evaluate
@@ -324,6 +327,10 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
+    from flashdex.system.run_files import require_run
+
+    for folder in args.paths:  # before anything large is loaded
+        require_run(folder, or_library=True)
     with loading():
         from flashdex.reports.run.terminal import verification_lines
         from flashdex.training.loaded import verify
@@ -338,7 +345,10 @@ def _verify(args: argparse.Namespace) -> int:
 def _score(args: argparse.Namespace) -> int:
     absent = [str(file) for file in args.files if not file.is_file()]
     if absent:
-        raise FlashdexError(f"{', '.join(absent)}: there is no such file")
+        raise FlashdexError(
+            f"{', '.join(absent)}: no such file. Name stored rollouts, "
+            "RUN/rollouts/*.npz; of a whole run 'flashdex replay RUN' tells more"
+        )
     with loading():
         from flashdex.reports.run.terminal import finding_lines, score_table
         from flashdex.rollouts.rollout import Rollout

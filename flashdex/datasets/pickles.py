@@ -23,7 +23,8 @@ import numpy as np
 import scipy.sparse as sp
 
 MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
-MAX_INT = 2**64
+MAX_STEPS = 20_000_000  # of the pickle machine, some seconds
+MAX_INT = 2**64  # of a number that is no magic
 MAX_PARTS = 50_000_000  # of the containers of a file
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
@@ -273,7 +274,9 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
     tens of gigabytes for ten bytes of file; after this check both are true.
     """
     start, puts = file.tell(), 0
-    for code, part, _ in pickletools.genops(file):
+    for number, (code, part, _) in enumerate(pickletools.genops(file)):
+        if number > MAX_STEPS:
+            raise pickle.UnpicklingError(f"more than {MAX_STEPS:,} steps")
         if code.name in ("PUT", "BINPUT", "LONG_BINPUT"):
             if not isinstance(part, int) or part > puts:
                 raise pickle.UnpicklingError("the memo of the pickle is not in order")

@@ -20,9 +20,9 @@ from flashdex.keys import FINGERS, SIDES
 from flashdex.system.arrays import ArrayEntry
 from flashdex.system.files import open_plain
 from flashdex.system.names import check_name, check_names
+from flashdex.system.run_files import MANIFEST
 
 SCHEMA = 2
-MANIFEST = "manifest.json"
 MAX_MANIFEST = 32 << 20  # bytes; a thousand motions have about one million
 MAX_PARTS = 256  # of an object
 FPS_RANGE = (1.0, 10_000.0)  # 1/s

@@ -38,6 +38,7 @@ from flashdex.system.names import check_name, file_stem
 
 _LOG = logging.getLogger(__name__)
 
+MANIFEST = "manifest.json"  # of a motion library
 RECIPE, VERSIONS, DIFF = "recipe.yaml", "versions.json", "git.diff"
 BASELINES, MOTIONS = "baselines.json", "motions.json"
 METRICS, CSV, SESSIONS = "metrics.jsonl", "metrics.csv", "sessions.jsonl"
@@ -223,6 +224,21 @@ def read_recipe(run_dir: Path) -> str:
         "it (every checkpoint holds a copy), and give new values to --resume as "
         "key=value."
     )
+
+
+def require_run(path: Path, *, or_library: bool = False) -> None:
+    """Refuse a folder that holds no run, or, ``or_library``, no motion library either.
+
+    Raises:
+        RunError: it does not.
+    """
+    known = (RECIPE, MANIFEST) if or_library else (RECIPE,)
+    if not any(os.path.lexists(path / name) for name in known):
+        what = "neither a run nor a motion library" if or_library else "no run"
+        raise RunError(
+            f"{path}: {what}, there is no {' and no '.join(known)} in it. Give the "
+            "folder that 'flashdex train' wrote, usually runs/<name>."
+        )
 
 
 def run_id(run_dir: Path) -> str:

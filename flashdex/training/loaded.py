@@ -42,6 +42,7 @@ from flashdex.system.run_files import (
     check_sessions,
     read_metrics,
     read_recipe,
+    require_run,
     rollout_name,
 )
 from flashdex.training.build import RunBuilder
@@ -106,10 +107,7 @@ def verify(path: str | Path) -> Verification:
     path = Path(path)
     if (path / MANIFEST).exists():
         return _verify_library(path)
-    if not (path / RECIPE).exists():
-        raise RunError(
-            f"{path}: neither a run (no {RECIPE}) nor a motion library (no {MANIFEST})."
-        )
+    require_run(path, or_library=True)
     files, findings = read_all_files(path)
     truth, why = open_truth(path)
     try:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from flashdex.datasets import pickles
 from flashdex.datasets.fields import numbers
 from flashdex.datasets.files import (
     load_npy,
@@ -187,6 +188,14 @@ def laughs(levels, make):
     for _ in range(levels):
         item = make([item] * 10)
     return item
+
+
+def test_pickle_of_endless_steps_is_one_message(tmp_path, monkeypatch):
+    monkeypatch.setattr(pickles, "MAX_STEPS", 1000)
+    path = tmp_path / "a.pkl"
+    path.write_bytes(b"N0" * 2000 + b"N.")
+    with pytest.raises(DemoError, match="more than 1,000 steps"):
+        load_pickle(path)
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,33 @@ def laughs(levels, make):
     return item
 
 
+def nested_keys(levels):
+    """A dictionary whose key is a tuple of two of the tuple below it, and so on."""
+    pair = "h{0}h{0}\x86q{1}0"  # twice from the memo, a tuple, to the memo, gone
+    tuples = [pair.format(chr(i), chr(i + 1)) for i in range(levels)]
+    text = "\x80\x02})q\x000" + "".join(tuples) + "h" + chr(levels) + "Ns."
+    return text.encode("latin-1")
+
+
+@pytest.mark.parametrize("levels", [5, 60])
+def test_pickle_of_keys_that_never_end(tmp_path, levels):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(nested_keys(levels))
+    if levels < 10:
+        assert load_pickle(path) == pickle.loads(nested_keys(levels))
+        return
+    with pytest.raises(DemoError, match="keys that would take hours"):
+        load_pickle(path)
+
+
+def test_pickle_of_one_large_key_many_times(tmp_path):
+    path, size = tmp_path / "a.pkl", 30_000
+    key = b"(" + b"K\x01" * size + b"tq\x00"
+    path.write_bytes(b"\x80\x02}" + key + b"N" + b"s(" + b"h\x00N" * size + b"u.")
+    with pytest.raises(DemoError, match="keys that would take hours"):
+        load_pickle(path)
+
+
 def test_pickle_of_endless_steps_is_one_message(tmp_path, monkeypatch):
     monkeypatch.setattr(pickles, "MAX_STEPS", 1000)
     path = tmp_path / "a.pkl"

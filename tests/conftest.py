@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 
 pytest_plugins = ["fixture_recordings", "fixture_runs"]
+
+
+def pytest_configure():
+    """Hear Ctrl-C, also where a shell started the tests in the background."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 # Heavy imports stand inside the fixtures: tests that need none of them stay fast.
 

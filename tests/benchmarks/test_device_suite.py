@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import sys
 
 import pytest
+
+from flashdex.system.jsonl import read_lines
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def lines(suite, tmp_path):
 
 
 def written(lines):
-    return [json.loads(line) for line in lines.out.read_text().splitlines()]
+    return read_lines(lines.out)
 
 
 def python(code):

@@ -14,7 +14,7 @@ MP4 = b"\0\0\0 ftypisom" + bytes(40)
 NAMES = (
     *FILES,
     *FOLDERS,
-    *(f"{FILMS}/push{end}" for end in (".mp4", ".png", "_poster.png")),
+    *(f"{FILMS}/push{end}" for end in (".mp4", ".png", "~poster.png")),
     *(f"{ROLLOUTS}/push{end}" for end in (".npz", ".certificate.json")),
 )
 
@@ -59,7 +59,7 @@ def test_a_film_is_shown(filmed, report):
     assert (filmed / REPORT).read_text().count("data:") == 3
 
 
-@pytest.mark.parametrize("end", [".mp4", ".png", "_poster.png"])
+@pytest.mark.parametrize("end", [".mp4", ".png", "~poster.png"])
 @pytest.mark.parametrize("fault", ["another kind", "too large", "empty"])
 def test_what_is_no_film_is_not_shown(filmed, report, monkeypatch, end, fault):
     path = filmed / FILMS / f"push{end}"

@@ -70,7 +70,7 @@ def told_twice(folder):
 LIES = {
     "converted": counters(nontrivial=50.0),
     "cumulative": counters(cumulative=50.0),
-    "certified": counters(certified=0.0),
+    "certified": counters(certified=50.0),
     "robust": counters(robust=50.0),
     "per hour": counters(per_hour=9e9),
     "early curve": edit(

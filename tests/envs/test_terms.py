@@ -78,9 +78,8 @@ def test_a_registered_term_is_checked_and_stands_on_the_page(my_terms):
     spec.loader.exec_module(script)
     page = script.render()
     assert "### env.rewards.slow_object\n\nObjects that hardly turn" in page
-    assert "| `scale` | `1.0` | number &gt; 0 and &le; 1000 | Steepness, s/rad. |" in page
-        "| `scale` | `1.0` | number &gt; 0 and &le; 1e+06 | Steepness, s/rad. |" in page
-    )
+    row = "| `scale` | `1.0` | number &gt; 0 and &le; 1000 | Steepness, s/rad. |"
+    assert row in page
     assert "### env.terminations.object_lost" in page
     assert "### env.transforms.object_height\n\nHeight of each hand's object" in page
 

@@ -234,9 +234,14 @@ def require_run(path: Path, *, or_library: bool = False) -> None:
     """
     known = (RECIPE, MANIFEST) if or_library else (RECIPE,)
     if not any(os.path.lexists(path / name) for name in known):
-        what = "neither a run nor a motion library" if or_library else "no run"
+        what = (
+            "neither a run nor a motion library"
+            if or_library
+            else "not a run directory"
+        )
         raise RunError(
-            f"{path}: {what}, there is no {' and no '.join(known)} in it. Give the "
+            f"{path}: {what}, there is no "
+            f"{' and no '.join(known)} in it. Give the "
             "folder that 'flashdex train' wrote, usually runs/<name>."
         )
 

@@ -106,7 +106,7 @@ class RunClaims:
                 self.fault(where, text)
             if self.motions and line["motion"] not in self.motions:
                 self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
-        if lines and self.is_bound and not self._sessions():
+        if lines and self.is_bound and not self._sessions:
             self.fault("lines", "there are none", file=SESSIONS)
         self._proofs(lines)
         self._counts(lines)
@@ -194,15 +194,16 @@ class RunClaims:
 
     def was_overridden(self) -> bool:
         """A later session than the first was given other values."""
-        starts = [x for x in self._sessions() if x.get("event") == "start"]
+        starts = [x for x in self._sessions if x.get("event") == "start"]
         return any(session.get("overrides") for session in starts[1:])
 
     def _is_over(self) -> bool:
         """The last session ended in order, and so counted all its attempts."""
-        last = self._sessions()[-1:]
+        last = self._sessions[-1:]
         ended = any(x.get("event") == "end" and x.get("why") != "error" for x in last)
         return ended and not self.was_overridden()
 
+    @cached_property
     def _sessions(self) -> list[dict[str, Any]]:
         try:
             return read_sessions(self.run_dir)

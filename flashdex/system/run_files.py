@@ -207,12 +207,8 @@ def read_recipe(run_dir: Path) -> str:
     Raises:
         RunError: it is missing, damaged, or not as flashdex wrote it.
     """
-    text = read_own(run_dir, RECIPE)
-    if text is None:
-        raise RunError(
-            f"{run_dir}: not a run directory, there is no {RECIPE} in it. Give the "
-            "folder that 'flashdex train' wrote, usually runs/<name>."
-        )
+    require_run(run_dir)
+    text = read_own(run_dir, RECIPE) or ""
     body = text[: text.rfind("# sha256 of the lines above: ")]
     if seal_text(body) == text:
         return body

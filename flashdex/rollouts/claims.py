@@ -132,22 +132,25 @@ class RunClaims:
         # an override counts other motions, or by another criterion
         if not self.is_bound or not self.motions or self.was_overridden():
             return
-        try:
-            records = read_metrics(self.run_dir)
-        except RunError:
-            return  # told by ``_attempts``
+        if self._metrics is None:
+            return
         tally = Tally(self.motions, self.of_run.get("criterion", ""))
-        for text in count_faults(records, lines, tally):
+        for text in count_faults(self._metrics, lines, tally):
             self.fault("counts", text, file="metrics.jsonl")
+
+    @cached_property
+    def _metrics(self) -> list[dict[str, Any]] | None:
+        """Records of the metrics; None, and a fault, where they cannot be read."""
+        try:
+            return read_metrics(self.run_dir)
+        except RunError as error:
+            self.fault("metrics", str(error), file="metrics.jsonl")
+            return None
 
     def _attempts(self) -> int:
         """Attempts that the last record of the metrics counts."""
-        try:
-            records = read_metrics(self.run_dir)
-            return int(records[-1].get("convert/attempts", 0)) if records else 0
-        except (RunError, TypeError, ValueError) as error:
-            self.fault("metrics", str(error), file="metrics.jsonl")
-            return 0
+        records = self._metrics
+        return int(records[-1].get("convert/attempts", 0)) if records else 0
 
     @cached_property
     def baselines(self) -> dict[tuple[str, str], list[str]] | None:

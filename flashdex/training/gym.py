@@ -87,7 +87,7 @@ class GymTask(Task):
         what = [gym.env_id, gym.max_episode_steps, gym.rescale_actions]
         return str([*what, algo.n_step, algo.gamma])
 
-    def prepare(self, run_dir: Path, env: GymEnv, *, changed: bool) -> None:
+    def prepare(self, run_dir: Path, env: GymEnv) -> None:
         """Take the worlds."""
         self.env = env
         self._returns = torch.zeros(env.num_envs, 1, dtype=torch.float64)

@@ -267,7 +267,7 @@ def make_trainer(
         restore(learner, state, worlds_key=task.worlds_key)
     if changed:
         write_recipe(run_dir, dump_recipe(task.recipe))
-    task.prepare(run_dir, env, changed=changed)
+    task.prepare(run_dir, env)
     start = begin_session(
         run_dir,
         env_steps=state["env_steps"] if state else 0,

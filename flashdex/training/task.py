@@ -61,8 +61,8 @@ class Task(Protocol):
     def check_inputs(self, run_dir: Path) -> None:
         """Refuse what is not what the run began with, by content."""
 
-    def prepare(self, run_dir: Path, env: Any, *, changed: bool) -> None:
-        """Open what may refuse a session; ``changed``: overrides were given."""
+    def prepare(self, run_dir: Path, env: Any) -> None:
+        """Open what may refuse a session."""
 
     def begin(self, start: SessionStart, state: dict[str, Any] | None) -> None:
         """Open the rest; ``state`` is the checkpoint that is gone on from."""

@@ -132,7 +132,7 @@ class TrackingTask(Task):
             everything = {"motions": {**known, **self._contents}}
             write_object(everything, run_dir, MOTIONS)
 
-    def prepare(self, run_dir: Path, env: TrackingEnv, *, changed: bool) -> None:
+    def prepare(self, run_dir: Path, env: TrackingEnv) -> None:
         """Score the baselines, what is new of them, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)

@@ -43,18 +43,18 @@ class Tally:
                 self.count(line)
 
     def count(self, line: Line) -> bool:
-        """Count a line that is in the file; is it the motion's first that passes?"""
+        """Count a line that is in the file; is the motion done by it?"""
         name = line["motion"]
         self.attempts[name] = self.attempts.get(name, 0) + 1
         self.last[name] = line["converted"]
-        before = self.conversions.get(name)
+        before, was_done = self.conversions.get(name), self.is_done(name)
         if before is None or self.moves_more(line, before):
             if line["converted"]:
                 self.conversions[name] = dict(line)
         elif line.get("verdict") is not None and not self.moves_more(before, line):
             newest = {key: line.get(key) for key in ("certified", "verdict")}
             before.update(newest)
-        return before is None and line["converted"]
+        return self.is_done(name) and not was_done
 
     @staticmethod
     def moves_more(line: Line, before: Line) -> bool:
@@ -78,6 +78,15 @@ class Tally:
     def num_passed(self) -> int:
         """Motions with at least one passing attempt, trivial ones too."""
         return len(self.conversions)
+
+    def is_done(self, name: str) -> bool:
+        """Has the motion a passing attempt in which the object moves as it should?"""
+        return name in self.conversions and not is_unmoved(self.conversions[name])
+
+    @property
+    def done(self) -> list[str]:
+        """Motions of which no further attempt is needed."""
+        return [name for name in self.conversions if self.is_done(name)]
 
     @property
     def _earned(self) -> list[Line]:

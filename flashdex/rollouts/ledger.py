@@ -116,7 +116,7 @@ class Ledger(Tally):
                 child process first.
 
         Returns:
-            The line, and whether this attempt is the motion's first that passes.
+            The line, and whether the motion is done by this attempt.
         """
         name = rollout.motion
         summary = rollout.summary(self.criterion)

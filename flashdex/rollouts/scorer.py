@@ -43,13 +43,13 @@ class InlineScorer:
     def submit(self, episode: Episode, wall_s: float) -> dict[str, Any]:
         """Score a finished episode at so many seconds of the run; return its line."""
         rollout = self.builder.build(episode)
-        line, is_first = self.ledger.record(rollout, wall_s=wall_s)
-        if is_first:
+        line, is_done = self.ledger.record(rollout, wall_s=wall_s)
+        if is_done:
             self._converted.append(rollout.motion)
         return line
 
     def collect(self, *, wait: bool = False) -> list[str]:
-        """Motions whose first passing attempt was found since the last call."""
+        """Motions that are done since the last call."""
         converted, self._converted = self._converted, []
         return converted
 
@@ -101,7 +101,7 @@ class ProcessScorer:
             raise self._died() from error
 
     def collect(self, *, wait: bool = False) -> list[str]:
-        """Motions whose first passing attempt was found since the last call.
+        """Motions that are done since the last call.
 
         ``wait`` until all episodes are scored and their lines written.
 

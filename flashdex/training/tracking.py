@@ -155,7 +155,7 @@ class TrackingTask(Task):
             )
         for name in ledger.adopt(wall_s=start.wall_s):
             _LOG.info("%s: its stored rollout had no line yet, and has one now", name)
-        for name in ledger.conversions:
+        for name in ledger.done:
             self._mark_converted(name)
         self.scorer: Scorer = self._open_scorer()
         self.recorder = EpisodeRecorder(self.env)
@@ -226,7 +226,7 @@ class TrackingTask(Task):
 
     def end_reason(self) -> str:
         """``all converted``, when that ends the run."""
-        everything = self.ledger.num_passed == len(self.ledger.names)
+        everything = len(self.ledger.done) == len(self.ledger.names)
         stops = self.recipe.train.stop_when_all_converted
         return "all converted" if stops and everything else ""
 

@@ -356,6 +356,17 @@ def limits_of(rollout: Rollout) -> dict[str, Any]:
     raise AssertionError(name)
 
 
+# what the provenance of a stored rollout says
+PROVENANCE: dict[str, type] = {
+    **dict.fromkeys(("run", "date", "recipe_sha256", "library_sha256"), str),
+    **dict.fromkeys(("motion_sha256", "reference_sha256"), str),
+    **dict.fromkeys(("physics", "limits"), dict),
+}
+# and its versions, those of an engine's own packages besides
+MADE_BY = ("flashdex", "torch", "torchrl", "tensordict", "mujoco", "python")
+MADE_BY += ("engine", "hardware")
+
+
 def bindings_of(rollout: Rollout) -> dict[str, Any]:
     """What the provenance of a rollout says of it."""
     return {

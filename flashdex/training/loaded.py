@@ -44,7 +44,9 @@ from flashdex.system.run_files import (
     read_recipe,
     require_run,
     rollout_name,
+    run_id,
 )
+from flashdex.training.baselines import check_baselines
 from flashdex.training.build import RunBuilder
 from flashdex.training.checkpoint import (
     check_format,
@@ -57,9 +59,17 @@ from flashdex.training.run_dir import load_learner, load_run_recipe
 
 
 def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
-    """Recipe and library of a run, to verify its rollouts against.
+    """Recipe and library of a run, to verify its rollouts against; see below."""
+    builder, why = _open_builder(run_dir)
+    return builder and _truth(builder), why
 
-    Nothing is prepared.
+
+def _truth(builder: RunBuilder) -> Truth:
+    return Truth(builder.recipe, builder.library, builder.hands, builder.bank)
+
+
+def _open_builder(run_dir: str | Path) -> tuple[RunBuilder | None, str]:
+    """What builds the parts of a run; nothing is prepared.
 
     Returns:
         None, and why, where the library is not at hand.
@@ -68,10 +78,9 @@ def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
         recipe = expect_kind(load_run_recipe(Path(run_dir)), Recipe, where=str(run_dir))
         if find_library(recipe) is None:
             return None, "the library that recipe.yaml names is not here"
-        builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
+        return RunBuilder.from_recipe(recipe, device=torch.device("cpu")), ""
     except FlashdexError as error:
         return None, str(error)
-    return Truth(recipe, builder.library, builder.hands, builder.bank), ""
 
 
 @dataclass(frozen=True)
@@ -109,13 +118,17 @@ def verify(path: str | Path) -> Verification:
         return _verify_library(path)
     require_run(path, or_library=True)
     files, findings = read_all_files(path)
-    truth, why = open_truth(path)
+    builder, why = _open_builder(path)
     try:
-        verified = verify_run(path, truth)
+        verified = verify_run(path, builder and _truth(builder))
+        if builder is not None and not any(f.is_fault for f in verified.ledger):
+            recipes = [era.recipe for era in verified.eras[:-1]]
+            former = [recipe for recipe in recipes if isinstance(recipe, Recipe)]
+            findings += check_baselines(builder, path, former)
     except RunError as error:
         if (path / CONVERSIONS).exists():
             findings.append(Finding(CONVERSIONS, "rollouts", str(error), False))
-        verified = Verified([], [])
+        verified = Verified([], [], [])
     for one in verified.rollouts:
         if one.holds:
             files.append(f"{rollout_name(one.motion)}, {one.found}")
@@ -145,8 +158,9 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
         DUMP: lambda: read_dump(run_dir / DUMP),
         **{
             name: partial(read_object, run_dir, name)
-            for name in (VERSIONS, BASELINES, MOTIONS, EVALUATION)
+            for name in (BASELINES, MOTIONS, EVALUATION)
         },
+        VERSIONS: partial(run_id, run_dir),
     }
     files: list[str] = []
     findings: list[Finding] = []
@@ -172,7 +186,10 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
 
 
 def _check_checkpoint(run_dir: Path, path: Path) -> None:
-    check_format(read_checkpoint(run_dir, path.name), path)
+    state = read_checkpoint(run_dir, path.name)
+    check_format(state, path, ("run", "recipe"))
+    if state["run"] != run_id(run_dir):
+        raise RunError(f"{path}: is that of another run.")
 
 
 class RunPolicy(TensorDictModuleBase):

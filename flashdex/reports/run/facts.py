@@ -136,7 +136,7 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
 def _certificates(run_dir: Path) -> dict[str, Line]:
     found = {}
     for path in own_files(run_dir, ROLLOUTS, "*.certificate.json"):
-        certificate = read_object(run_dir, ROLLOUTS, path.name)
+        certificate = read_object(run_dir, ROLLOUTS, path.name, sealed=False)
         identity = certificate.get("identity")
         name = identity.get("motion") if isinstance(identity, dict) else None
         found[str(name or path.name.removesuffix(".certificate.json"))] = certificate

@@ -21,6 +21,7 @@ from flashdex.rollouts.ledger import (
     read_ledger,
     rollout_name,
 )
+from flashdex.rollouts.rollout import MADE_BY
 from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_object
 from flashdex.system.run_files import (
@@ -110,6 +111,18 @@ class RunClaims:
     def run(self) -> str:
         """Id of the run."""
         return self._read(VERSIONS, lambda: run_id(self.run_dir), "")
+
+    @cached_property
+    def made_by(self) -> dict[str, str]:
+        """Versions that all rollouts were made by: of a run of one session."""
+        found = self._read(VERSIONS, lambda: read_object(self.run_dir, VERSIONS), {})
+        for name in MADE_BY:
+            if not isinstance(found.get(name), str):
+                self.fault("file", f"does not say which '{name}'", file=VERSIONS)
+        starts = [x for x in self._sessions if x["event"] == "start"]
+        # the recipe says the engine, and a GPU stands before the processor
+        names = {*MADE_BY} - {"engine", "hardware"} if len(starts) == 1 else ()
+        return {name: str(found.get(name)) for name in names}
 
     @cached_property
     def eras(self) -> list[Era]:

@@ -197,10 +197,16 @@ class _RunCheck:
             if name in names:
                 sha = library.motion_hash(names.index(name))
                 known["motion_sha256", "that of the library"] = sha
-        return [
+        found = [
             Finding(file, key, f"is another than {of}: it was made from another")
             for (key, of), right in known.items()
             if said.get(key) != right
+        ]
+        made_by = json.loads(rollout.versions)
+        return found + [
+            Finding(file, "versions", f"{key} is not {right!a}, as {VERSIONS} says")
+            for key, right in self.claims.made_by.items()
+            if made_by.get(key) != right
         ]
 
     def _certificate(

@@ -54,8 +54,8 @@ def begin_session(
 
     The counters go back to the checkpoint. The clock does not: it goes on from the
     latest moment that any file of the run knows of. Env steps beyond the checkpoint
-    were simulated for nothing and are added up. ``before`` is the recipe, YAML, that the
-    overrides change.
+    were simulated for nothing and are added up. ``before`` is the recipe, YAML, that
+    the overrides change.
     """
     path = own_file(run_dir, SESSIONS)
     drop_cut_line(path)

@@ -238,7 +238,11 @@ class RunClaims:
 
     def _counts(self, lines: list[dict[str, Any]], names: Sequence[str] | None) -> None:
         """Conversions that the metrics count, against the lines of each era."""
-        records = self._read(METRICS, lambda: read_metrics(self.run_dir), [])
+        records = self._records
+        for key in ("hours", "env_steps"):
+            values = [0.0, *(record[key] for record in records)]
+            if values != sorted(values):
+                self.fault("records", f"{key} go back", file=METRICS)
         last = self.eras[-1]
         for era in self.eras:
             own = [r for r in records if era.since < r["hours"] * 3600 <= era.until]
@@ -262,6 +266,10 @@ class RunClaims:
                 self.fault("counts", text, file=METRICS)
 
     @cached_property
+    def _records(self) -> list[dict[str, Any]]:
+        return self._read(METRICS, lambda: read_metrics(self.run_dir), [])
+
+    @cached_property
     def _ended(self) -> bool:
         """The last session ended in order, and so counted all its attempts."""
         last = self._sessions[-1:]
@@ -280,8 +288,14 @@ class RunClaims:
             wall_s = line["wall_s"]
             if not is_date(line["date"]):
                 self.fault(where, f"{line['date']!a:.40} is no date", file=SESSIONS)
-        if self._sessions and self._sessions[-1]["event"] == "end":
-            told = self._sessions[-1]["lines"]
+        last = self._sessions[-1] if self._sessions else {"event": ""}
+        if self._ended and self._records:
+            steps = self._records[-1]["env_steps"]
+            if steps != last["env_steps"]:
+                text = f"env_steps are {last['env_steps']}, {steps:g} of {METRICS}"
+                self.fault("end", text, file=SESSIONS)
+        if last["event"] == "end":
+            told = last["lines"]
             now = self._read(SESSIONS, lambda: line_counts(self.run_dir), told)
             for name in {*told, *now}:
                 if told.get(name) != now.get(name):

@@ -11,11 +11,15 @@ from typing import Any
 import mujoco
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.metrics.criteria import moves_too_little, stays_behind
+from flashdex.metrics.criteria import (
+    criterion_names,
+    moves_too_little,
+    stays_behind,
+)
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout, limits_of
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder, remove_own
 from flashdex.system.jsonl import append_line, check_keys, drop_cut_line, read_lines
@@ -213,6 +217,8 @@ class Ledger(Tally):
         return self.path.stat().st_size if self.path.is_file() else 0
 
 
+COUNTERS = ("env_steps", "frame", "seed", "wall_s")
+ROUNDED = 1e-6  # m or rad, of the values in a line
 SPEED = "convert/per_hour"  # of a clock that went on between two readings
 SPEED_TOLERANCE = 0.05
 
@@ -224,11 +230,28 @@ def line_faults(line: dict[str, Any], of_run: dict[str, Any]) -> list[str]:
         for key, value in of_run.items()
         if line[key] != value
     ]
+    found += [f"{key} is {line[key]}" for key in COUNTERS if line[key] < 0]
+    named, known = [line["criterion"], *line["passed"]], criterion_names()
+    if odd := [name for name in named if name not in known]:
+        return [*found, f"names {odd[0]!a:.60}, which is no criterion"]
     ratios = {key: line[f"{key}_ratio"] for key in ("lift", "path")}
     passes = line["criterion"] in line["passed"]
+    if passes and not _is_within(line["errors"], line["criterion"]):
+        found.append("errors are not those of a pass")
     if passes and moves_too_little(ratios) and not is_unmoved(line):
         found.append(f"lacks '{UNMOVED}' in trivial, by its ratios")
     return found
+
+
+def _is_within(errors: dict[str, float], criterion: str) -> bool:
+    """Whether these are the values of a criterion, and those with a most are below."""
+    limits = limits_of(criterion, 0)
+    del limits["grace"]
+    return errors.keys() == limits.keys() and all(
+        value <= limits[name] + ROUNDED
+        for name, value in errors.items()
+        if name not in ("lift", "path")
+    )
 
 
 def count_faults(

@@ -346,13 +346,13 @@ def reference_sha256(rollout: Rollout) -> str:
     return found.hexdigest()
 
 
-def limits_of(rollout: Rollout) -> dict[str, Any]:
-    """Grace and limits of the criterion of a rollout, as this version has them."""
-    name = resolve_criterion(rollout.criterion)
-    for criterion in make_criteria(grace=rollout.grace):
-        if name in (criterion.name + s for s in ("", "_left", "_right")):
-            limits = {term.quantity: term.limit for term in criterion.terms}
-            return {"grace": criterion.grace, **limits}
+def limits_of(criterion: str, grace: int) -> dict[str, Any]:
+    """Grace and limits of a criterion, as this version has them."""
+    name = resolve_criterion(criterion)
+    for known in make_criteria(grace=grace):
+        if name in (known.name + s for s in ("", "_left", "_right")):
+            limits = {term.quantity: term.limit for term in known.terms}
+            return {"grace": known.grace, **limits}
     raise AssertionError(name)
 
 
@@ -371,5 +371,5 @@ def bindings_of(rollout: Rollout) -> dict[str, Any]:
     """What the provenance of a rollout says of it."""
     return {
         "reference_sha256": reference_sha256(rollout),
-        "limits": limits_of(rollout),
+        "limits": limits_of(rollout.criterion, rollout.grace),
     }

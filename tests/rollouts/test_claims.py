@@ -92,6 +92,17 @@ LIES = {
     "trivial by baselines": edit(
         CONVERSIONS, lambda x: [y | {"trivial": ["do_nothing"]} for y in x]
     ),
+    "errors of no pass": edit(CONVERSIONS, lambda x: x[-1]["errors"].clear()),
+    "errors beyond": edit(
+        CONVERSIONS, lambda x: x[-1]["errors"].update(object_pos=1.0)
+    ),
+    "no criterion": edit(CONVERSIONS, lambda x: x[-1]["passed"].append("best")),
+    "negative": edit(CONVERSIONS, lambda x: x[-1].update(frame=-1)),
+    "steps at the end": edit("sessions.jsonl", lambda x: x[-1].update(env_steps=9)),
+    "hours that go back": edit("metrics.jsonl", lambda x: x[-1].update(hours=-1.0)),
+    "record after the end": edit("metrics.jsonl", lambda x: [*x, x[-1]]),
+    "other versions": lambda run: versions(torch="0")(run),
+    "no versions": lambda run: versions(hardware=None)(run),
     "no trivial": without("trivial"),
     "old lines": without("trivial", "rollout_sha256", "certificate_sha256"),
     "moved later": told_twice,

@@ -21,7 +21,7 @@ from flashdex.metrics.criteria_table import resolve_criterion
 from flashdex.recipe.check import build_config
 from flashdex.rollouts.build import grace_steps, link_names
 from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
-from flashdex.rollouts.findings import Finding, differences, is_date, short
+from flashdex.rollouts.findings import Finding, Notes, differences, is_date, short
 from flashdex.rollouts.models import compare_models, implausible, rebuild_around
 from flashdex.rollouts.resimulation import (
     Simulation,
@@ -50,7 +50,7 @@ _UNBOUND = {"provenance", "versions", "errors", "env_steps", "model_xml"}
 _STATES = {"qpos", "qvel"}  # simulated anew, see ``_states``
 
 
-class RolloutCheck:
+class RolloutCheck(Notes):
     """All that is found in one rollout; ``run`` it once.
 
     Args:
@@ -61,20 +61,12 @@ class RolloutCheck:
     """
 
     def __init__(self, rollout: Rollout, file: str, truth: Truth | None) -> None:
-        self.rollout, self.file, self.truth = rollout, file, truth
-        self.findings: list[Finding] = []
+        super().__init__(file)
+        self.rollout, self.truth = rollout, truth
         self.is_sound = False  # its numbers mean something
         self.model: mujoco.MjModel | None = None  # to be simulated; None: it may not
         self._provenance = json.loads(rollout.provenance)
         self._versions = json.loads(rollout.versions)
-
-    def fault(self, what: str, text: str) -> None:
-        """Note a difference."""
-        self.findings.append(Finding(self.file, what, text))
-
-    def skip(self, what: str, text: str) -> None:
-        """Note what could not be checked."""
-        self.findings.append(Finding(self.file, what, text, is_fault=False))
 
     def run(self) -> list[Finding]:
         """Check everything that the findings before leave a meaning."""
@@ -156,8 +148,8 @@ class RolloutCheck:
                 self.fault("versions", f"has {short(made_by.get(name))} as '{name}'")
         for name, value in bindings_of(r).items():
             if name in said:
-                found = differences(said[name], value, at=name, tolerance=0.0)
-                self.findings += [Finding(self.file, name, text) for text in found]
+                for text in differences(said[name], value, at=name, tolerance=0.0):
+                    self.fault(name, text)
         wrench = r.wrench
         if wrench is not None and np.abs(wrench).max(initial=0.0) > 0:
             self.fault("wrench", f"is up to {np.abs(wrench).max():.3g}, expected none")

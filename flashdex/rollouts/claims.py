@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from flashdex.errors import FlashdexError
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.recipe import RunRecipe, parse_recipe
-from flashdex.rollouts.findings import Finding, at, is_date
+from flashdex.rollouts.findings import Notes, at, is_date
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     count_faults,
@@ -84,20 +84,12 @@ class Era:
         return {key: value for key, value in found.items() if value is not None}
 
 
-class RunClaims:
+class RunClaims(Notes):
     """The ledger, and what the other files say of it; ``lines`` checks them once."""
 
     def __init__(self, run_dir: Path) -> None:
+        super().__init__(CONVERSIONS)
         self.run_dir = run_dir
-        self.findings: list[Finding] = []
-
-    def fault(self, what: str, text: str, *, file: str = CONVERSIONS) -> None:
-        """Note a difference."""
-        self.findings.append(Finding(file, what, text))
-
-    def skip(self, what: str, text: str, *, file: str = CONVERSIONS) -> None:
-        """Note what could not be checked."""
-        self.findings.append(Finding(file, what, text, is_fault=False))
 
     def _read(self, file: str, reader: Callable[[], Found], other: Found) -> Found:
         """What a reader finds; ``other``, and a fault, where it refuses the file."""

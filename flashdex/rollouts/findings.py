@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -21,6 +21,27 @@ class Finding:
     def __str__(self) -> str:
         word = "" if self.is_fault else "not checked: "
         return f"{self.file}: {word}{self.what}: {self.text}"
+
+
+class Notes:
+    """Findings of one file, as they come up."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.findings: list[Finding] = []
+
+    def fault(self, what: str, text: str, *, file: str = "") -> None:
+        """Note a difference."""
+        self.findings.append(Finding(file or self.file, what, text))
+
+    def skip(self, what: str, text: str, *, file: str = "") -> None:
+        """Note what could not be checked."""
+        self.findings.append(Finding(file or self.file, what, text, is_fault=False))
+
+
+def faults(findings: Iterable[Finding]) -> list[Finding]:
+    """Those that are not only unchecked."""
+    return [finding for finding in findings if finding.is_fault]
 
 
 def differences(

@@ -7,7 +7,6 @@ a certificate its rollout, a line of the ledger both files, each line the one be
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from flashdex.recipe import Recipe
 from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.claims import Era, RunClaims
-from flashdex.rollouts.findings import Finding, differences
+from flashdex.rollouts.findings import Finding, differences, faults
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
@@ -49,14 +48,9 @@ class Replayed:
     findings: tuple[Finding, ...]  # of rollout, certificate and its line
 
     @property
-    def faults(self) -> list[Finding]:
-        """What is not as it should be."""
-        return [finding for finding in self.findings if finding.is_fault]
-
-    @property
     def holds(self) -> bool:
         """The conversion is proven, and the files say so truthfully."""
-        return not self.faults and self.found in PROVEN
+        return not faults(self.findings) and self.found in PROVEN
 
 
 @dataclass(frozen=True)
@@ -75,8 +69,7 @@ class Verified:
     @property
     def holds(self) -> bool:
         """Every stored rollout is proven, and the lines are those of the run."""
-        no_fault = not any(finding.is_fault for finding in self.ledger)
-        return no_fault and all(one.holds for one in self.rollouts)
+        return not faults(self.ledger) and all(one.holds for one in self.rollouts)
 
 
 def verify_run(run_dir: str | Path, truth: Truth | None = None) -> Verified:
@@ -279,8 +272,3 @@ class _RunCheck:
 def _without_end(passed: list[Any]) -> list[Any]:
     """Criteria but that of terminations, which a file does not hold."""
     return [name for name in passed if not str(name).startswith("completed")]
-
-
-def faults(findings: Iterable[Finding]) -> list[Finding]:
-    """Those that are not only unchecked."""
-    return [finding for finding in findings if finding.is_fault]

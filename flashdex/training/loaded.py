@@ -20,7 +20,7 @@ from flashdex.motions.library import verify_library
 from flashdex.motions.library_format import MANIFEST
 from flashdex.recipe import Recipe, RunRecipe, expect_kind
 from flashdex.replay.disk import check_rows
-from flashdex.rollouts.findings import Finding
+from flashdex.rollouts.findings import Finding, faults
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
@@ -102,7 +102,7 @@ class Verification:
     @property
     def holds(self) -> bool:
         """Nothing differs."""
-        return not any(finding.is_fault for finding in self.findings)
+        return not faults(self.findings)
 
 
 def verify(path: str | Path) -> Verification:
@@ -121,7 +121,7 @@ def verify(path: str | Path) -> Verification:
     builder, why = _open_builder(path)
     try:
         verified = verify_run(path, builder and _truth(builder))
-        if builder is not None and not any(f.is_fault for f in verified.ledger):
+        if builder is not None and not faults(verified.ledger):
             recipes = [era.recipe for era in verified.eras[:-1]]
             former = [recipe for recipe in recipes if isinstance(recipe, Recipe)]
             findings += check_baselines(builder, path, former)
@@ -132,7 +132,7 @@ def verify(path: str | Path) -> Verification:
     for one in verified.rollouts:
         if one.holds:
             files.append(f"{rollout_name(one.motion)}, {one.found}")
-        elif not one.faults:
+        elif not faults(one.findings):
             text = f"is {one.found}, no proof"
             findings.append(Finding(rollout_name(one.motion), "certificate", text))
     return Verification(path, files, [*findings, *verified.findings], why)

@@ -6,13 +6,15 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from flashdex.errors import FlashdexError
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
-from flashdex.recipe import RunRecipe, parse_recipe
+from flashdex.recipe import Recipe, RunRecipe, parse_recipe
+from flashdex.recipe.reader import parse_yaml
 from flashdex.rollouts.findings import Notes, at, is_date
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
@@ -70,18 +72,30 @@ class Era:
             for part in parts
         )
 
+    @property
+    def budget(self) -> float:
+        """Env steps that it may come to, with those of the last vector step."""
+        if not isinstance(self.recipe, Recipe):
+            return math.inf
+        return self.recipe.total_env_steps + self.recipe.env.num_envs
+
     @cached_property
     def of_lines(self) -> dict[str, Any]:
         """What all lines of it have in common."""
-        names = {"seed": "seed", "engine": "physics.engine"}
-        names["criterion"] = "train.criterion"
-        found: dict[str, Any] = {}
-        for key, name in names.items():
-            value: Any = self.recipe
-            for word in name.split("."):
-                value = getattr(value, word, None)
-            found[key] = value
+        found = {
+            "seed": at(self.plain, "seed"),
+            "engine": at(self.plain, "physics", "engine"),
+            "criterion": at(self.plain, "train", "criterion"),
+        }
         return {key: value for key, value in found.items() if value is not None}
+
+    @cached_property
+    def plain(self) -> dict[str, Any]:
+        """Keys and values of the recipe, known here or not."""
+        try:
+            return parse_yaml(self.text, where=RECIPE)
+        except FlashdexError:
+            return {}
 
 
 class RunClaims(Notes):
@@ -112,8 +126,7 @@ class RunClaims(Notes):
             if not isinstance(found.get(name), str):
                 self.fault("file", f"does not say which '{name}'", file=VERSIONS)
         starts = [x for x in self._sessions if x["event"] == "start"]
-        # the recipe says the engine, and a GPU stands before the processor
-        names = {*MADE_BY} - {"engine", "hardware"} if len(starts) == 1 else ()
+        names = {*MADE_BY} - {"engine"} if len(starts) == 1 else ()  # see the recipe
         return {name: str(found.get(name)) for name in names}
 
     @cached_property
@@ -121,6 +134,8 @@ class RunClaims(Notes):
         """Recipes of the run, oldest first; the last is that of ``recipe.yaml``."""
         text = self._read(RECIPE, lambda: read_recipe(self.run_dir), "")
         found = [Era(text, -1.0, math.inf, self._recipe(text))]
+        if found[0].recipe is None:
+            self.skip("recipe", "cannot be read here", file=RECIPE)
         starts = [x for x in self._sessions if x["event"] == "start"]
         for number, start in reversed(list(enumerate(starts, start=1))):
             before = after = found[0]
@@ -235,6 +250,10 @@ class RunClaims(Notes):
             values = [0.0, *(record[key] for record in records)]
             if values != sorted(values):
                 self.fault("records", f"{key} go back", file=METRICS)
+        budgets = [era.budget for era in self.eras]
+        if records and records[-1]["env_steps"] > max(budgets):
+            text = f"go to {records[-1]['env_steps']:g} env steps, beyond the budget"
+            self.fault("records", text, file=METRICS)
         last = self.eras[-1]
         for era in self.eras:
             own = [r for r in records if era.since < r["hours"] * 3600 <= era.until]
@@ -272,9 +291,12 @@ class RunClaims(Notes):
 
         That lines are missing is told by ``check_sessions``, at a resume as well.
         """
-        wall_s = 0.0
+        wall_s, before = 0.0, "end"
         for number, line in enumerate(self._sessions, start=1):
             where = f"line {number}"
+            if before == line["event"] == "end":
+                self.fault(where, "ends a session that did not begin", file=SESSIONS)
+            before = line["event"]
             if line["wall_s"] < wall_s:
                 self.fault(where, "begins before the one above it ended", file=SESSIONS)
             wall_s = line["wall_s"]
@@ -293,6 +315,17 @@ class RunClaims(Notes):
                 if told.get(name) != now.get(name):
                     text = f"{now.get(name)} lines, {told.get(name)} by the session"
                     self.fault("lines", text, file=name)
+
+    def is_of_session(self, date: Any) -> bool:
+        """Whether some session lasted at a moment, to a day."""
+        dates = [x["date"] for x in self._sessions]
+        if not all(map(is_date, [date, *dates])):
+            return False
+        moment, *moments = map(datetime.fromisoformat, [date, *dates])
+        day = timedelta(days=1)
+        begun = [m for m in moments if m - day <= moment]
+        later = [m for m in moments if moment <= m + day]
+        return bool(begun) and (bool(later) or not self._ended)
 
     @cached_property
     def _baselines(self) -> dict[tuple[str, str], list[str]]:

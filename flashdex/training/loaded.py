@@ -18,7 +18,7 @@ from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
 from flashdex.motions.library import verify_library
 from flashdex.motions.library_format import MANIFEST
-from flashdex.recipe import Recipe, RunRecipe, expect_kind
+from flashdex.recipe import Recipe, RunRecipe, expect_kind, parse_recipe
 from flashdex.replay.disk import check_rows
 from flashdex.rollouts.findings import Finding, faults
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
@@ -42,6 +42,7 @@ from flashdex.system.run_files import (
     check_sessions,
     read_metrics,
     read_recipe,
+    read_sessions,
     require_run,
     rollout_name,
     run_id,
@@ -188,8 +189,17 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
 def _check_checkpoint(run_dir: Path, path: Path) -> None:
     state = read_checkpoint(run_dir, path.name)
     check_format(state, path, ("run", "recipe"))
-    if state["run"] != run_id(run_dir):
-        raise RunError(f"{path}: is that of another run.")
+    sessions = read_sessions(run_dir)
+    recipes = [read_recipe(run_dir), *(line.get("before") for line in sessions)]
+    known = [parse_recipe(text, where=RECIPE) for text in recipes if text]
+    last = sessions[-1] if sessions else {}
+    is_later = last.get("event") == "end" and state["env_steps"] > last["env_steps"]
+    if (
+        state["run"] != run_id(run_dir)
+        or parse_recipe(state["recipe"], where=str(path)) not in known
+        or is_later
+    ):
+        raise RunError(f"{path}: is that of another run, or of another time of it.")
 
 
 class RunPolicy(TensorDictModuleBase):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_origin, get_type_hints
@@ -232,7 +232,7 @@ class Rollout:
     def load(cls, path: str | Path) -> Rollout:
         """Read and check a file; every fault is a RunError that names the key."""
         data = _read(Path(path))
-        required = {f.name for f in fields(cls) if f.default is MISSING}
+        required = {f.name for f in fields(cls) if f.default is not None}
         absent = sorted(required - data.keys())
         if absent:
             raise RunError(

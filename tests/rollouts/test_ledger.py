@@ -215,12 +215,12 @@ def test_an_object_that_hardly_moves_is_trivial_until_it_moves(
     still = copy.deepcopy(passing)
     still.object_pos[:] = still.object_pos[:1]
     ledger = open_ledger(tmp_path, library)
-    assert record(ledger, still, env_steps=10, wall_s=2.0)
+    assert not record(ledger, still, env_steps=10, wall_s=2.0)
     line = read_lines(tmp_path / CONVERSIONS)[-1]
     assert line["trivial"] == [UNMOVED]
     assert (line["lift_ratio"], line["path_ratio"]) == (0.0, 0.0)
     assert ledger.note == "0 of 3 converted, and 1 trivial"
-    record(ledger, passing, env_steps=20, wall_s=3.0)
+    assert record(ledger, passing, env_steps=20, wall_s=3.0)
     assert ledger.note == "1 of 3 converted, 0 certified"
     assert ledger.conversions["right_box"]["env_steps"] == 20
     # a later one that hardly moves takes nothing back, nor does a new session

@@ -84,6 +84,8 @@ def load_run(run_dir: str | Path) -> RunData:
     text = read_recipe(path)  # refuses what is none, or was changed
     check_run(path)
     check_sessions(path)
+    versions = read_object(path, VERSIONS)
+    versions.pop("run", None)  # its id, for machines
     try:
         composed = parse_yaml(text, where=str(path / RECIPE))
     except RecipeError as error:
@@ -91,7 +93,7 @@ def load_run(run_dir: str | Path) -> RunData:
     return RunData(
         path=path,
         recipe=composed,
-        versions=read_object(path, VERSIONS),
+        versions=versions,
         metrics=_drop_repeated(read_metrics(path)),
         attempts=read_lines(path / CONVERSIONS, ATTEMPT),
         baselines=_baselines(path),

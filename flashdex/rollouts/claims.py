@@ -43,6 +43,7 @@ from flashdex.system.run_files import (
 BASELINE_NAMES = ("do_nothing", "kinematic_playback", "frozen_object")
 # of a recipe: what the baselines of a motion depend on
 OF_BASELINES = ("hand", "motions", "physics", "env")
+REASONS = ("budget", "all converted", "wall_limit_s", "signal", "error")
 CLOCK = 1e-3  # s, to which lines round the clock of a run
 Found = TypeVar("Found")
 
@@ -297,6 +298,11 @@ class RunClaims(Notes):
             if before == line["event"] == "end":
                 self.fault(where, "ends a session that did not begin", file=SESSIONS)
             before = line["event"]
+            if before == "start" and line["run"] != self.run:
+                self.fault(where, f"is of another run than {VERSIONS}", file=SESSIONS)
+            if before == "end" and line["why"] not in REASONS:
+                text = f"ended by {line['why']!a:.40}, which is no reason"
+                self.fault(where, text, file=SESSIONS)
             if line["wall_s"] < wall_s:
                 self.fault(where, "begins before the one above it ended", file=SESSIONS)
             wall_s = line["wall_s"]
@@ -332,6 +338,8 @@ class RunClaims(Notes):
         """Baselines by motion and criterion that they pass."""
         rows = self._read(BASELINES, lambda: read_object(self.run_dir, BASELINES), {})
         found: dict[tuple[str, str], list[str]] = {}
+        for name in rows.keys() - {*BASELINE_NAMES}:
+            self.fault(name[:60], "is no baseline", file=BASELINES)
         for name in BASELINE_NAMES:
             for motion in self.motions:
                 passed = at(rows, name, motion, "passed")

@@ -100,6 +100,11 @@ LIES = {
     "negative": edit(CONVERSIONS, lambda x: x[-1].update(frame=-1)),
     "steps at the end": edit("sessions.jsonl", lambda x: x[-1].update(env_steps=9)),
     "hours that go back": edit("metrics.jsonl", lambda x: x[-1].update(hours=-1.0)),
+    "no reason to end": edit("sessions.jsonl", lambda x: x[-1].update(why="x")),
+    "end of nothing": edit("sessions.jsonl", lambda x: x[1:]),
+    "a fourth baseline": lambda run: write_object(
+        read_object(run, "baselines.json") | {"do_nothing2": {}}, run, "baselines.json"
+    ),
     "record after the end": edit("metrics.jsonl", lambda x: [*x, x[-1]]),
     "other versions": lambda run: versions(torch="0")(run),
     "no versions": lambda run: versions(hardware=None)(run),

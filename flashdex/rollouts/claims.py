@@ -308,7 +308,7 @@ class RunClaims(Notes):
             wall_s = line["wall_s"]
             if not is_date(line["date"]):
                 self.fault(where, f"{line['date']!a:.40} is no date", file=SESSIONS)
-        last = self._sessions[-1] if self._sessions else {"event": ""}
+        last: dict[str, Any] = (self._sessions or [{"event": ""}])[-1]
         if self._ended and self._records:
             steps = self._records[-1]["env_steps"]
             if steps != last["env_steps"]:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.hands.spec import load_hand
+from flashdex.rollouts.findings import faults
 from flashdex.rollouts.verify import verify_run
 from flashdex.system.jsonl import read_lines
 from flashdex.training.checkpoint import has_checkpoint, load_checkpoint
@@ -165,7 +166,7 @@ def check_conversions(run_dir: Path) -> dict[str, Any]:
     converted = {line["motion"] for line in lines if line["converted"]}
     found = {one.motion: one for one in verify_run(run_dir).rollouts}
     assert converted == set(found), (converted, set(found))
-    disagree = [name for name, one in found.items() if one.faults]
+    disagree = [name for name, one in found.items() if faults(one.findings)]
     assert not disagree, disagree
     return {
         "attempts": len(lines),

@@ -20,11 +20,12 @@ from benchmarks.common import output
 from benchmarks.common.ceilings import memory_gb, reset_peak_memory
 from benchmarks.common.turns import physics_rate, room_used
 from benchmarks.env import describe_bench
-from flashdex.recipe import Recipe
+from flashdex.recipe import Recipe, dump_recipe
 from flashdex.system.allocator import keep_freed_memory
+from flashdex.system.run_files import new_run
 from flashdex.training.build import RunBuilder
 from flashdex.training.run_dir import make_trainer
-from flashdex.training.tracking import BASELINES, TrackingTask
+from flashdex.training.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too
@@ -113,9 +114,10 @@ def _open_trainer(recipe: Recipe) -> Iterator[tuple[Trainer, dict[str, Any], flo
     """A trainer in a temporary run folder, what it is, and the seconds it took."""
     begin = timer()
     bench = RunBuilder.from_recipe(recipe)
-    with tempfile.TemporaryDirectory(prefix="flashdex-bench-") as folder:
-        # the baselines are scores of the collection, no part of the loop
-        (Path(folder) / BASELINES).write_text("{}", encoding="utf-8")
+    with (
+        tempfile.TemporaryDirectory(prefix="flashdex-bench-") as folder,
+        new_run(Path(folder), dump_recipe(recipe)),
+    ):
         torch.manual_seed(recipe.seed)
         trainer = make_trainer(TrackingTask(bench), Path(folder), None, [])
         described = describe_bench(bench, trainer.env)

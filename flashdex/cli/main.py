@@ -351,8 +351,9 @@ def _score(args: argparse.Namespace) -> int:
         )
     with loading():
         from flashdex.reports.run.terminal import finding_lines, score_table
+        from flashdex.rollouts.findings import faults
         from flashdex.rollouts.rollout import Rollout
-        from flashdex.rollouts.verify import faults, verify_file
+        from flashdex.rollouts.verify import verify_file
 
     found = {str(file): Rollout.load(file).score() for file in args.files}
     findings = {str(file): verify_file(file) for file in args.files}

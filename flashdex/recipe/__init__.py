@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from flashdex.recipe.merge import dump_recipe as dump_recipe
     from flashdex.recipe.merge import load_recipe as load_recipe
     from flashdex.recipe.merge import override_recipe as override_recipe
+    from flashdex.recipe.merge import parse_recipe as parse_recipe
     from flashdex.recipe.motions import MotionsConfig as MotionsConfig
     from flashdex.recipe.run import LoggerConfig as LoggerConfig
     from flashdex.recipe.run import LoopConfig as LoopConfig

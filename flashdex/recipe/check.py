@@ -55,12 +55,12 @@ def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
     problems: list[str] = []
     kind, own = split_foreign(data, problems)
     algo, env = own.pop("algo", {}), own.pop("env", {})
-    recipe: Any = _build(kind.root, own, "", problems)
+    recipe: Any = build_config(kind.root, own, "", problems)
     if "env" in kind.keys:
         recipe = dataclasses.replace(recipe, env=_read_env(env, problems))
     # An algorithm may add keys.
     cls = config_class(algo.get("kind") if isinstance(algo, Mapping) else None)
-    recipe = dataclasses.replace(recipe, algo=_build(cls, algo, "algo", problems))
+    recipe = dataclasses.replace(recipe, algo=build_config(cls, algo, "algo", problems))
     return recipe, problems + _find_names(recipe) + kind.find_conflicts(recipe)
 
 
@@ -106,10 +106,10 @@ def validate(recipe: R) -> R:
 def _read_env(data: Any, problems: list[str]) -> EnvConfig:
     """Read the environment, whose terms are registered by name."""
     if not isinstance(data, Mapping):
-        return _build(EnvConfig, data, "env", problems)
+        return build_config(EnvConfig, data, "env", problems)
     plain = {key: value for key, value in data.items() if key not in KINDS}
     terms = {kind: _read_terms(kind, data, problems) for kind in KINDS}
-    env = _build(EnvConfig, plain, "env", problems)
+    env = build_config(EnvConfig, plain, "env", problems)
     return dataclasses.replace(env, **terms)
 
 
@@ -139,7 +139,7 @@ def _read_terms(
             continue
         result[name] = options
         if options is not None:
-            part = _build(term.options, options, where, problems)
+            part = build_config(term.options, options, where, problems)
             result[name] = target | dataclasses.asdict(part)
     return result
 
@@ -163,7 +163,7 @@ def _whole(text: str) -> float:
     return int(value) if value.is_integer() else value
 
 
-def _build(cls: type, data: Any, path: str, problems: list[str]) -> Any:
+def build_config(cls: type, data: Any, path: str, problems: list[str]) -> Any:
     """Build a dataclass; what is wrong is noted and taken out, the rest read again."""
     text = json.dumps([data], default=lambda value: {type(value).__name__: repr(value)})
     root, noted = json.loads(text, parse_float=_whole), set()

@@ -25,7 +25,7 @@ from flashdex.recipe.overrides import (
     merge,
     parse_overrides,
 )
-from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
+from flashdex.recipe.reader import parse_yaml, read_text
 from flashdex.recipe.schema import Recipe, RunRecipe
 from flashdex.recipe.store import (
     find_option,
@@ -289,7 +289,12 @@ def load_recipe(path: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
     """
     if not Path(path).exists():
         raise FlashdexError(f"{path}: there is no such recipe file")
-    return _change(read_yaml(Path(path)), overrides, where=str(path))
+    return parse_recipe(read_text(Path(path)), overrides, where=str(path))
+
+
+def parse_recipe(text: str, overrides: Sequence[str] = (), *, where: str) -> RunRecipe:
+    """Read the text of a complete recipe; see ``load_recipe``."""
+    return _change(parse_yaml(text, where=where), overrides, where=where)
 
 
 def dump_recipe(recipe: RunRecipe, path: str | Path | None = None) -> str:

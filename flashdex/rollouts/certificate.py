@@ -18,7 +18,7 @@ import numpy as np
 
 from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
-from flashdex.rollouts.findings import OLD, Finding, at, differences, short
+from flashdex.rollouts.findings import Finding, at, differences, short
 from flashdex.rollouts.resimulation import (
     PERTURBATION,
     Perturbation,
@@ -249,15 +249,10 @@ def compare_certificates(
     stored: dict[str, Any], new: dict[str, Any], file: str
 ) -> list[Finding]:
     """Every number of a stored certificate that is not that of a new one."""
-    schema = at(stored, "identity", "schema")
     found: list[Finding] = []
-    if schema != CERTIFICATE_SCHEMA:
-        found.append(Finding(file, "hashes", OLD, is_fault=False))
-        stored, new = _old_part(stored), _old_part(new)
-        new["nominal"] = {k: new["nominal"].get(k) for k in stored["nominal"]}
     here = [at(new, *name.split(".")) for name in ELSEWHERE]
     there = [at(stored, *name.split(".")) for name in ELSEWHERE]
-    if schema == CERTIFICATE_SCHEMA and here != there:
+    if here != there:
         text = f"certified elsewhere ({short(there)}): its numbers may differ a little"
         found.append(Finding(file, "numbers", text, is_fault=False))
         stored, new = _same_anywhere(stored), _same_anywhere(new)
@@ -274,17 +269,4 @@ def _same_anywhere(certificate: dict[str, Any]) -> dict[str, Any]:
         if isinstance(part := certificate.get(name), dict)
         else part
         for name in names
-    }
-
-
-def _old_part(certificate: dict[str, Any]) -> dict[str, Any]:
-    """Verdict, and state and values of each criterion."""
-    nominal = certificate.get("nominal")
-    nominal = nominal if isinstance(nominal, dict) else {}
-    return {
-        "verdict": certificate.get("verdict"),
-        "nominal": {
-            name: {key: at(verdict, key) for key in ("state", "values")}
-            for name, verdict in nominal.items()
-        },
     }

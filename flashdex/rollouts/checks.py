@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import mujoco
@@ -18,10 +18,10 @@ from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
 from flashdex.hands.spec import load_hand
 from flashdex.metrics.criteria_table import resolve_criterion
-from flashdex.recipe import validate
+from flashdex.recipe.check import build_config
 from flashdex.rollouts.build import grace_steps, link_names
 from flashdex.rollouts.certificate import DEVIATION_M, DEVIATION_RAD
-from flashdex.rollouts.findings import OLD, Finding, differences, short
+from flashdex.rollouts.findings import Finding, Notes, differences, is_date, short
 from flashdex.rollouts.models import compare_models, implausible, rebuild_around
 from flashdex.rollouts.resimulation import (
     Simulation,
@@ -30,7 +30,7 @@ from flashdex.rollouts.resimulation import (
     simulate,
     tracked_points,
 )
-from flashdex.rollouts.rollout import Rollout, bindings_of
+from flashdex.rollouts.rollout import MADE_BY, PROVENANCE, Rollout, bindings_of
 from flashdex.rollouts.safety import state_deviation
 from flashdex.rollouts.truth import Truth, settings_of
 from flashdex.system.machine import versions
@@ -47,44 +47,26 @@ _UNFIT = (ValueError, KeyError, TypeError, IndexError, OverflowError)
 MAX_SUBSTEPS = 1_000_000  # of a file that says itself how many; an hour at 60 Hz
 # of the file alone: no library says them, hashes bind them
 _UNBOUND = {"provenance", "versions", "errors", "env_steps", "model_xml"}
-_OF_RECIPE = {"ctrl", "criterion"}  # what an override may change in a run
 _STATES = {"qpos", "qvel"}  # simulated anew, see ``_states``
 
 
-class RolloutCheck:
+class RolloutCheck(Notes):
     """All that is found in one rollout; ``run`` it once.
 
     Args:
         rollout: as loaded.
         file: its name, for the findings.
-        truth: recipe and library of its run, None when they are not at hand.
-        is_current: the recipe is that by which the rollout was made, not a later one
-            of the same run.
+        truth: recipe that it was made by, and its library; None when they are not at
+            hand.
     """
 
-    def __init__(
-        self,
-        rollout: Rollout,
-        file: str,
-        truth: Truth | None,
-        *,
-        is_current: bool = True,
-    ) -> None:
-        self.rollout, self.file, self.truth = rollout, file, truth
-        self.is_current = is_current
-        self.findings: list[Finding] = []
+    def __init__(self, rollout: Rollout, file: str, truth: Truth | None) -> None:
+        super().__init__(file)
+        self.rollout, self.truth = rollout, truth
         self.is_sound = False  # its numbers mean something
         self.model: mujoco.MjModel | None = None  # to be simulated; None: it may not
         self._provenance = json.loads(rollout.provenance)
         self._versions = json.loads(rollout.versions)
-
-    def fault(self, what: str, text: str) -> None:
-        """Note a difference."""
-        self.findings.append(Finding(self.file, what, text))
-
-    def skip(self, what: str, text: str) -> None:
-        """Note what could not be checked."""
-        self.findings.append(Finding(self.file, what, text, is_fault=False))
 
     def run(self) -> list[Finding]:
         """Check everything that the findings before leave a meaning."""
@@ -152,14 +134,22 @@ class RolloutCheck:
                 self.fault(name, "holds a quaternion that is no rotation")
 
     def _bound(self) -> None:
-        """Hashes and limits that the file itself carries."""
-        r = self.rollout
+        """Hashes and limits that the file itself carries, and that it has them all."""
+        r, said, made_by = self.rollout, self._provenance, self._versions
+        for name in PROVENANCE.keys() ^ said.keys():
+            self.fault("provenance", f"{'holds' if name in said else 'lacks'} {name!a}")
+        for name in PROVENANCE.keys() & said.keys():
+            if type(said[name]) is not PROVENANCE[name]:
+                self.fault("provenance", f"has {short(said[name])} as '{name}'")
+        if "date" in said and not is_date(said["date"]):
+            self.fault("provenance", f"{short(said['date'])} is no date")
+        for name in MADE_BY:
+            if type(made_by.get(name)) is not str:
+                self.fault("versions", f"has {short(made_by.get(name))} as '{name}'")
         for name, value in bindings_of(r).items():
-            stored = self._provenance.get(name)
-            if stored is None:
-                self.skip(name, OLD)
-            elif stored != value:
-                self.fault(name, f"is {short(stored)}, expected {short(value)}")
+            if name in said:
+                for text in differences(said[name], value, at=name, tolerance=0.0):
+                    self.fault(name, text)
         wrench = r.wrench
         if wrench is not None and np.abs(wrench).max(initial=0.0) > 0:
             self.fault("wrench", f"is up to {np.abs(wrench).max():.3g}, expected none")
@@ -168,7 +158,7 @@ class RolloutCheck:
         """The stored model against one built anew; sets what may be simulated."""
         r = self.rollout
         where = f"{self.file}: model_xml"
-        truth = self._scenes()
+        truth = self.truth
         if truth is None or r.motion not in truth.bank.names:
             self.model = compile_mjcf(r.model_xml, where=where)
             self._model_alone(self.model)
@@ -187,21 +177,6 @@ class RolloutCheck:
         for name, text in implausible(scene.model, bodies).items():
             self.skip(f"model {name}", f"{text}, by recipe and library themselves")
 
-    def _scenes(self) -> Truth | None:
-        """Library and physics of its scene; the file names those of another recipe."""
-        if self.truth is None or self.is_current:
-            return self.truth
-        settings = self._settings()
-        if settings is None:
-            return None
-        self.skip("physics", "settings and controls: the recipe changed since then")
-        try:
-            recipe = replace(self.truth.recipe, physics=settings)
-            return replace(self.truth, recipe=validate(recipe))
-        except FlashdexError as error:
-            self.fault("physics", f"are no settings ({error})")
-            return None
-
     def _model_alone(self, model: mujoco.MjModel) -> None:
         """Without library: everything but shapes, masses and supports."""
         r = self.rollout
@@ -209,8 +184,9 @@ class RolloutCheck:
         try:
             hands = load_hand(r.hand)
         except FlashdexError:
-            note = self.skip if settings is None else self.fault
-            note("hand", f"'{r.hand}' is not known here; install the package of it")
+            self.fault(
+                "hand", f"'{r.hand}' is not known here; install the package of it"
+            )
         bodies = load_simulation(r, model).object_body
         for name, text in implausible(model, bodies).items():
             self.fault(f"model {name}", text)
@@ -228,19 +204,18 @@ class RolloutCheck:
         self.skip("model", f"shapes, masses and supports of objects: {NO_LIBRARY}")
 
     def _settings(self) -> PhysicsConfig | None:
-        """Physics settings of the run, else those that the file names."""
-        if self.truth is not None and self.is_current:
-            return self.truth.recipe.physics
+        """Physics settings that the file names; None, and a fault, where it cannot."""
         stored = self._provenance.get("physics")
-        if stored is None:
-            self.skip("model", OLD)
+        names = {field.name for field in fields(PhysicsConfig)}
+        if not isinstance(stored, dict) or stored.keys() != names:
+            self.fault("physics", "are not all of the settings, or more")
             return None
-        try:
-            settings = PhysicsConfig(**stored)
-            step = settings.timestep * settings.decimation * self.rollout.fps
-        except TypeError as error:
-            self.fault("physics", f"are no settings ({error})")
+        problems: list[str] = []
+        settings = build_config(PhysicsConfig, stored, "physics", problems)
+        if problems:
+            self.fault("physics", f"are no settings ({problems[0]})")
             return None
+        step = settings.timestep * settings.decimation * self.rollout.fps
         if settings.decimation != self.rollout.decimation or not abs(step - 1) < 1e-3:
             self.fault("physics", f"{step:.3g} control steps in one")
         return settings
@@ -260,7 +235,7 @@ class RolloutCheck:
             return
         here = versions()
         same = all(
-            self._versions.get(k, here[k]) == here[k] for k in ("mujoco", "engine")
+            self._versions.get(k) == here[k] for k in ("mujoco", "engine")
         ) and _machine(self._versions) == _machine(here)
         if same:
             for name, error in worst.items():
@@ -314,12 +289,8 @@ class RolloutCheck:
         verdict = r.score()[resolve_criterion(r.criterion)]
         if not verdict.is_passed:
             self.fault("criterion", f"{verdict.name} is not passed: {verdict.reason}")
-        stored = json.loads(r.errors)
-        if not stored:
-            self.skip("errors", "none are stored")
-            return
         expected = {k: round(v, 6) for k, v in verdict.values.items()}
-        for text in differences(stored, expected, tolerance=2e-6):
+        for text in differences(json.loads(r.errors), expected, tolerance=2e-6):
             self.fault("errors", text)
 
     def _truth(self) -> None:
@@ -344,19 +315,16 @@ class RolloutCheck:
             self.fault("qpos", f"{r.qpos.shape[1]} columns, expected {model.nq}")
             return
         self._fields(truth.remake(r, nodes=nodes))
-        if not self.is_current:
-            return
-        stored = self._provenance.get("physics")
-        if stored not in (None, settings_of(truth.recipe)):
-            self.fault("physics", "other settings than the recipe of the run")
-        engine = self._versions.get("engine", truth.recipe.physics.engine)
-        if engine != truth.recipe.physics.engine:
-            self.fault("versions", f"engine {engine}, another than the recipe's")
+        expected = json.loads(json.dumps(settings_of(truth.recipe)))
+        for text in differences(self._provenance.get("physics"), expected, at="is"):
+            self.fault("physics", f"{text}, by the recipe of the run")
+        engine = truth.recipe.physics.engine
+        if self._versions.get("engine") != engine:
+            self.fault("versions", f"engine is another than the recipe's, {engine}")
 
     def _fields(self, expected: Rollout) -> None:
         is_own = self._versions.get("engine") == "cpu"
         skipped = _UNBOUND | _STATES | {"model_sha256"}
-        skipped |= set() if self.is_current else _OF_RECIPE
         for name in (f.name for f in fields(Rollout)):
             a, b = getattr(self.rollout, name), getattr(expected, name)
             if name in skipped:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import FlashdexError
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
+from flashdex.recipe import Recipe, RunRecipe, parse_recipe
 from flashdex.recipe.reader import parse_yaml
-from flashdex.rollouts.findings import Finding, at
+from flashdex.rollouts.findings import Notes, at, is_date
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     count_faults,
@@ -18,14 +23,17 @@ from flashdex.rollouts.ledger import (
     read_ledger,
     rollout_name,
 )
+from flashdex.rollouts.rollout import MADE_BY
 from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_object
 from flashdex.system.run_files import (
     BASELINES,
+    METRICS,
     MOTIONS,
     RECIPE,
     SESSIONS,
     VERSIONS,
+    line_counts,
     read_metrics,
     read_recipe,
     read_sessions,
@@ -33,84 +41,193 @@ from flashdex.system.run_files import (
 )
 
 BASELINE_NAMES = ("do_nothing", "kinematic_playback", "frozen_object")
-MAX_JSON = 16 << 20  # bytes of a certificate
+# of a recipe: what the baselines of a motion depend on
+OF_BASELINES = ("hand", "motions", "physics", "env")
+REASONS = ("budget", "all converted", "wall_limit_s", "signal", "error")
+CLOCK = 1e-3  # s, to which lines round the clock of a run
+Found = TypeVar("Found")
 
 
-class RunClaims:
+@dataclass(frozen=True)
+class Era:
+    """A recipe of a run, and the seconds of the run in which it was the recipe."""
+
+    text: str
+    since: float
+    until: float
+    recipe: RunRecipe | None  # None: it cannot be read here
+
+    @property
+    def sha256(self) -> str:
+        """Of the recipe, as rollouts name it."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def holds(self, wall_s: float) -> bool:
+        """Whether a line of that second may be of it."""
+        return self.since - CLOCK <= wall_s <= self.until + CLOCK
+
+    def is_like(self, other: Era, parts: Sequence[str]) -> bool:
+        """Whether these parts of two recipes are the same."""
+        return all(
+            getattr(self.recipe, part, None) == getattr(other.recipe, part, None)
+            for part in parts
+        )
+
+    @property
+    def budget(self) -> float:
+        """Env steps that it may come to, with those of the last vector step."""
+        if not isinstance(self.recipe, Recipe):
+            return math.inf
+        return self.recipe.total_env_steps + self.recipe.env.num_envs
+
+    @cached_property
+    def of_lines(self) -> dict[str, Any]:
+        """What all lines of it have in common."""
+        found = {
+            "seed": at(self.plain, "seed"),
+            "engine": at(self.plain, "physics", "engine"),
+            "criterion": at(self.plain, "train", "criterion"),
+        }
+        return {key: value for key, value in found.items() if value is not None}
+
+    @cached_property
+    def plain(self) -> dict[str, Any]:
+        """Keys and values of the recipe, known here or not."""
+        try:
+            return parse_yaml(self.text, where=RECIPE)
+        except FlashdexError:
+            return {}
+
+
+class RunClaims(Notes):
     """The ledger, and what the other files say of it; ``lines`` checks them once."""
 
     def __init__(self, run_dir: Path) -> None:
+        super().__init__(CONVERSIONS)
         self.run_dir = run_dir
-        self.findings: list[Finding] = []
 
-    def fault(self, what: str, text: str, *, file: str = CONVERSIONS) -> None:
-        """Note a difference."""
-        self.findings.append(Finding(file, what, text))
+    def _read(self, file: str, reader: Callable[[], Found], other: Found) -> Found:
+        """What a reader finds; ``other``, and a fault, where it refuses the file."""
+        try:
+            return reader()
+        except FlashdexError as error:
+            self.fault("file", str(error), file=file)
+            return other
 
     @cached_property
-    def is_bound(self) -> bool:
-        """It has an id: all that older versions did not bind is bound in it."""
-        try:
-            return bool(run_id(self.run_dir))
-        except RunError:
-            return True
+    def run(self) -> str:
+        """Id of the run."""
+        return self._read(VERSIONS, lambda: run_id(self.run_dir), "")
 
     @cached_property
-    def of_run(self) -> dict[str, Any]:
-        """What all lines of a run have in common, as far as its files say."""
+    def made_by(self) -> dict[str, str]:
+        """Versions that all rollouts were made by: of a run of one session."""
+        found = self._read(VERSIONS, lambda: read_object(self.run_dir, VERSIONS), {})
+        for name in MADE_BY:
+            if not isinstance(found.get(name), str):
+                self.fault("file", f"does not say which '{name}'", file=VERSIONS)
+        starts = [x for x in self._sessions if x["event"] == "start"]
+        names = {*MADE_BY} - {"engine"} if len(starts) == 1 else ()  # see the recipe
+        return {name: str(found.get(name)) for name in names}
+
+    @cached_property
+    def eras(self) -> list[Era]:
+        """Recipes of the run, oldest first; the last is that of ``recipe.yaml``."""
+        text = self._read(RECIPE, lambda: read_recipe(self.run_dir), "")
+        found = [Era(text, -1.0, math.inf, self._recipe(text))]
+        if found[0].recipe is None:
+            self.skip("recipe", "cannot be read here", file=RECIPE)
+        starts = [x for x in self._sessions if x["event"] == "start"]
+        for number, start in reversed(list(enumerate(starts, start=1))):
+            before = after = found[0]
+            if start["before"]:
+                recipe, since = self._recipe(start["before"]), start["wall_s"]
+                before = Era(start["before"], -1.0, since, recipe)
+                found[:1] = [before, replace(after, since=since)]
+            elif number == 1:
+                continue  # what it was composed with
+            words = start["overrides"]
+            where = f"overrides of start {number}"
+            if after.recipe is None or any("=~" in word for word in words):
+                text = "of a recipe that cannot be read here, or of another home"
+                self.skip(where, text, file=SESSIONS)
+            elif after.recipe != self._recipe(before.text, words):
+                text = "do not lead to the recipe that the run went on with"
+                self.fault(where, text, file=SESSIONS)
+        return found
+
+    def _recipe(self, text: str, words: Sequence[str] = ()) -> RunRecipe | None:
         try:
-            recipe = parse_yaml(read_recipe(self.run_dir), where=RECIPE)
-            versions = read_object(self.run_dir, VERSIONS)
+            return parse_recipe(text, words, where=RECIPE)
         except FlashdexError:
-            return {}
-        found = {"seed": recipe.get("seed")}
-        if not self.was_overridden():
-            found["engine"] = versions.get("engine")
-            found["criterion"] = at(recipe, "train", "criterion")
-        return {key: value for key, value in found.items() if value is not None}
+            return None
+
+    @cached_property
+    def _same_motions(self) -> bool:
+        """All recipes of the run select the same motions."""
+        return all(era.is_like(self.eras[-1], ("motions",)) for era in self.eras)
+
+    def era_of(self, recipe_sha256: Any) -> Era | None:
+        """The newest era with a recipe of that hash."""
+        found = [era for era in self.eras if era.sha256 == recipe_sha256]
+        return found[-1] if found else None
 
     @cached_property
     def motions(self) -> dict[str, Any]:
         """Hash of each motion by name, as the run wrote them down."""
-        try:
-            found = read_object(self.run_dir, MOTIONS).get("motions", {})
-        except RunError as error:
-            self.fault("file", str(error), file=MOTIONS)
-            return {}
-        if not isinstance(found, dict) or (self.is_bound and not found):
+        found = self._read(MOTIONS, lambda: read_object(self.run_dir, MOTIONS), {})
+        motions = found.get("motions")
+        if not isinstance(motions, dict) or not motions:
             self.fault("motions", "names none", file=MOTIONS)
             return {}
-        return found
+        return motions
 
-    def lines(self) -> list[dict[str, Any]]:
-        """Lines of the ledger; one that is not as it was written ends the list."""
-        try:
-            lines = read_ledger(own_file(self.run_dir, CONVERSIONS))
-        except FlashdexError as error:
-            self.fault("lines", str(error))
-            return []
-        attempts, wall_s = self._attempts(), 0.0
-        if len(lines) < attempts:
-            self.fault("lines", f"{len(lines)} are left of {attempts} attempts")
-        if len(lines) > attempts and self._is_over():
-            self.fault("lines", f"{len(lines)} of {attempts} attempts")
+    def lines(self, names: Sequence[str] | None = None) -> list[dict[str, Any]]:
+        """Lines of the ledger; one that is not as it was written ends the list.
+
+        ``names`` of the motions that the recipe selects, where a library tells.
+        """
+        path, empty = own_file(self.run_dir, CONVERSIONS), list[dict[str, Any]]()
+        lines = self._read(CONVERSIONS, lambda: read_ledger(path), empty)
+        wall_s = 0.0
         for number, line in enumerate(lines, start=1):
             where = f"line {number}"
             if line["wall_s"] < wall_s:
                 self.fault(where, "is out of order: its wall_s is below the one before")
             wall_s = line["wall_s"]
             self._line(where, line)
-            if not self.is_bound:
-                continue
-            for text in line_faults(line, self.of_run):
-                self.fault(where, text)
-            if self.motions and line["motion"] not in self.motions:
-                self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
-        if lines and self.is_bound and not self._sessions:
+        if not self._sessions:
             self.fault("lines", "there are none", file=SESSIONS)
+        self._clocks()
         self._proofs(lines)
-        self._counts(lines)
+        self._counts(lines, names)
         return lines
+
+    def _line(self, where: str, line: dict[str, Any]) -> None:
+        """What one line says of itself, of its session and of its motion."""
+        eras = [era for era in self.eras if era.holds(line["wall_s"])]
+        told = [line_faults(line, era.of_lines) for era in eras]
+        for text in min(told, key=len, default=["is of no session"]):
+            self.fault(where, text)
+        named = line.get("rollout")
+        if named and named != rollout_name(line["motion"]):
+            self.fault(where, f"names {named!a}, not the rollout of its motion")
+        if self.motions and line["motion"] not in self.motions:
+            self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
+        if line["gpu_s"] not in (0.0, line["wall_s"]):
+            self.fault(where, f"gpu_s is {line['gpu_s']}, wall_s {line['wall_s']}")
+        if line["converted"] != (line["criterion"] in line["passed"]):
+            self.fault(where, "converted is not what the passed criteria say")
+        if named and not line["converted"]:
+            self.fault(where, "names a rollout of an attempt that did not pass")
+        expected = self._baselines.get((line["motion"], line["criterion"]), [])
+        if [b for b in line["trivial"] if b != UNMOVED] != expected:
+            text = f"trivial is {line['trivial']}, by the baselines {expected}"
+            if any(era.is_like(self.eras[-1], OF_BASELINES) for era in eras):
+                self.fault(where, text)
+            else:
+                text = "of lines by an earlier recipe, whose baselines are not kept"
+                self.skip("trivial", text)
 
     def _proofs(self, lines: list[dict[str, Any]]) -> None:
         """A motion is converted by the line that stores its first pass."""
@@ -127,99 +244,113 @@ class RunClaims:
                 text = "is the motion's first conversion, but names no rollout"
                 self.fault(f"line {number}", text)
 
-    def _counts(self, lines: list[dict[str, Any]]) -> None:
-        """Conversions that the metrics count, against the lines."""
-        # an override counts other motions, or by another criterion
-        if not self.is_bound or not self.motions or self.was_overridden():
-            return
-        if self._metrics is None:
-            return
-        tally = Tally(self.motions, self.of_run.get("criterion", ""))
-        for text in count_faults(self._metrics, lines, tally):
-            self.fault("counts", text, file="metrics.jsonl")
+    def _counts(self, lines: list[dict[str, Any]], names: Sequence[str] | None) -> None:
+        """Conversions that the metrics count, against the lines of each era."""
+        records = self._records
+        for key in ("hours", "env_steps"):
+            values = [0.0, *(record[key] for record in records)]
+            if values != sorted(values):
+                self.fault("records", f"{key} go back", file=METRICS)
+        budgets = [era.budget for era in self.eras]
+        if records and records[-1]["env_steps"] > max(budgets):
+            text = f"go to {records[-1]['env_steps']:g} env steps, beyond the budget"
+            self.fault("records", text, file=METRICS)
+        last = self.eras[-1]
+        for era in self.eras:
+            own = [r for r in records if era.since < r["hours"] * 3600 <= era.until]
+            motions = names if era is last and names is not None else None
+            motions = list(self.motions) if self._same_motions else motions
+            criterion = era.of_lines.get("criterion")
+            if not motions or criterion is None:
+                text = "of an era whose motions are not known: a resume chose others"
+                self.skip("counts", text, file=METRICS)
+                continue
+            counted = [
+                x
+                for x in lines
+                if x["criterion"] == criterion
+                and x["motion"] in motions
+                and x["wall_s"] <= era.until + CLOCK
+            ]
+            is_whole = era is last and self._ended
+            tally = Tally(motions, criterion)
+            for text in count_faults(own, counted, tally, is_whole=is_whole):
+                self.fault("counts", text, file=METRICS)
 
     @cached_property
-    def _metrics(self) -> list[dict[str, Any]] | None:
-        """Records of the metrics; None, and a fault, where they cannot be read."""
-        try:
-            return read_metrics(self.run_dir)
-        except RunError as error:
-            self.fault("metrics", str(error), file="metrics.jsonl")
-            return None
-
-    def _attempts(self) -> int:
-        """Attempts that the last record of the metrics counts."""
-        records = self._metrics
-        return int(records[-1].get("convert/attempts", 0)) if records else 0
+    def _records(self) -> list[dict[str, Any]]:
+        return self._read(METRICS, lambda: read_metrics(self.run_dir), [])
 
     @cached_property
-    def baselines(self) -> dict[tuple[str, str], list[str]] | None:
-        """Baselines by motion and criterion that they pass; None: not comparable."""
-        path = own_file(self.run_dir, BASELINES)
-        # an override scores them anew, for the lines from then on
-        if self.was_overridden():
-            return None
-        if not path.is_file():
-            if self.is_bound:
-                self.fault("file", "is missing", file=path.name)
-            return None
-        rows, fault = read_json(path)
-        if fault:
-            self.fault("file", fault, file=path.name)
-            return None
-        for name in BASELINE_NAMES if self.is_bound else ():
-            for motion in self.motions:
-                if not isinstance(at(rows, name, motion, "passed"), list):
-                    self.fault(name, f"no score of '{motion}'", file=path.name)
+    def _ended(self) -> bool:
+        """The last session ended in order, and so counted all its attempts."""
+        last = self._sessions[-1:]
+        return any(x["event"] == "end" and x["why"] != "error" for x in last)
+
+    def _clocks(self) -> None:
+        """Sessions follow one another, and an ended one left as many lines as it says.
+
+        That lines are missing is told by ``check_sessions``, at a resume as well.
+        """
+        wall_s, before = 0.0, "end"
+        for number, line in enumerate(self._sessions, start=1):
+            where = f"line {number}"
+            if before == line["event"] == "end":
+                self.fault(where, "ends a session that did not begin", file=SESSIONS)
+            before = line["event"]
+            if before == "start" and line["run"] != self.run:
+                self.fault(where, f"is of another run than {VERSIONS}", file=SESSIONS)
+            if before == "end" and line["why"] not in REASONS:
+                text = f"ended by {line['why']!a:.40}, which is no reason"
+                self.fault(where, text, file=SESSIONS)
+            if line["wall_s"] < wall_s:
+                self.fault(where, "begins before the one above it ended", file=SESSIONS)
+            wall_s = line["wall_s"]
+            if not is_date(line["date"]):
+                self.fault(where, f"{line['date']!a:.40} is no date", file=SESSIONS)
+        last: dict[str, Any] = (self._sessions or [{"event": ""}])[-1]
+        if self._ended and self._records:
+            steps = self._records[-1]["env_steps"]
+            if steps != last["env_steps"]:
+                text = f"env_steps are {last['env_steps']}, {steps:g} of {METRICS}"
+                self.fault("end", text, file=SESSIONS)
+        if last["event"] == "end":
+            told = last["lines"]
+            now = self._read(SESSIONS, lambda: line_counts(self.run_dir), told)
+            for name in {*told, *now}:
+                if told.get(name) != now.get(name):
+                    text = f"{now.get(name)} lines, {told.get(name)} by the session"
+                    self.fault("lines", text, file=name)
+
+    def is_of_session(self, date: Any) -> bool:
+        """Whether some session lasted at a moment, to a day."""
+        dates = [x["date"] for x in self._sessions]
+        if not all(map(is_date, [date, *dates])):
+            return False
+        moment, *moments = map(datetime.fromisoformat, [date, *dates])
+        day = timedelta(days=1)
+        begun = [m for m in moments if m - day <= moment]
+        later = [m for m in moments if moment <= m + day]
+        return bool(begun) and (bool(later) or not self._ended)
+
+    @cached_property
+    def _baselines(self) -> dict[tuple[str, str], list[str]]:
+        """Baselines by motion and criterion that they pass."""
+        rows = self._read(BASELINES, lambda: read_object(self.run_dir, BASELINES), {})
         found: dict[tuple[str, str], list[str]] = {}
-        for name, motions in rows.items():
-            for motion in motions if isinstance(motions, dict) else ():
-                for criterion in at(motions, motion, "passed") or ():
+        for name in rows.keys() - {*BASELINE_NAMES}:
+            self.fault(name[:60], "is no baseline", file=BASELINES)
+        for name in BASELINE_NAMES:
+            for motion in self.motions:
+                passed = at(rows, name, motion, "passed")
+                if not isinstance(passed, list):
+                    if self._same_motions:
+                        self.fault(name, f"no score of '{motion}'", file=BASELINES)
+                    passed = []
+                for criterion in map(str, passed):
                     found.setdefault((motion, criterion), []).append(name)
         return found
 
-    def _line(self, where: str, line: dict[str, Any]) -> None:
-        """What one line says of itself."""
-        named = line.get("rollout")
-        if named and named != rollout_name(line["motion"]):
-            self.fault(where, f"names {named!a}, not the rollout of its motion")
-        if line.get("gpu_s", 0.0) not in (0.0, line["wall_s"]):
-            self.fault(where, f"gpu_s is {line['gpu_s']}, wall_s {line['wall_s']}")
-        if line["converted"] != (line["criterion"] in line.get("passed", [])):
-            self.fault(where, "converted is not what the passed criteria say")
-        if self.baselines is not None and "trivial" in line:
-            expected = self.baselines.get((line["motion"], line["criterion"]), [])
-            if [b for b in line["trivial"] if b != UNMOVED] != expected:
-                text = f"trivial is {line['trivial']}, by the baselines {expected}"
-                self.fault(where, text)
-        if named and not line["converted"]:
-            self.fault(where, "names a rollout of an attempt that did not pass")
-
-    def was_overridden(self) -> bool:
-        """A later session than the first was given other values."""
-        starts = [x for x in self._sessions if x.get("event") == "start"]
-        return any(session.get("overrides") for session in starts[1:])
-
-    def _is_over(self) -> bool:
-        """The last session ended in order, and so counted all its attempts."""
-        last = self._sessions[-1:]
-        ended = any(x.get("event") == "end" and x.get("why") != "error" for x in last)
-        return ended and not self.was_overridden()
-
     @cached_property
     def _sessions(self) -> list[dict[str, Any]]:
-        try:
-            return read_sessions(self.run_dir)
-        except RunError:
-            return []
-
-
-def read_json(file: Path) -> tuple[dict[str, Any], str]:
-    """A JSON object, or why it is none."""
-    try:
-        if file.stat().st_size > MAX_JSON:
-            return {}, f"{file.stat().st_size} bytes are no certificate"
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        return {}, f"is no JSON ({error})"
-    return (found, "") if isinstance(found, dict) else ({}, "is no JSON object")
+        return self._read(SESSIONS, lambda: read_sessions(self.run_dir), [])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
-
-OLD = "written by an older version, which did not bind it"
 
 
 @dataclass(frozen=True)
@@ -22,6 +21,27 @@ class Finding:
     def __str__(self) -> str:
         word = "" if self.is_fault else "not checked: "
         return f"{self.file}: {word}{self.what}: {self.text}"
+
+
+class Notes:
+    """Findings of one file, as they come up."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.findings: list[Finding] = []
+
+    def fault(self, what: str, text: str, *, file: str = "") -> None:
+        """Note a difference."""
+        self.findings.append(Finding(file or self.file, what, text))
+
+    def skip(self, what: str, text: str, *, file: str = "") -> None:
+        """Note what could not be checked."""
+        self.findings.append(Finding(file or self.file, what, text, is_fault=False))
+
+
+def faults(findings: Iterable[Finding]) -> list[Finding]:
+    """Those that are not only unchecked."""
+    return [finding for finding in findings if finding.is_fault]
 
 
 def differences(
@@ -82,3 +102,11 @@ def at(value: Any, *names: str) -> Any:
     for name in names:
         value = value.get(name) if isinstance(value, dict) else None
     return value
+
+
+def is_date(text: Any) -> bool:
+    """Whether a text is a moment, with its time zone."""
+    try:
+        return datetime.fromisoformat(str(text)).tzinfo is not None
+    except ValueError:
+        return False

@@ -11,39 +11,35 @@ from typing import Any
 import mujoco
 
 from flashdex.errors import FlashdexError, RunError
-from flashdex.metrics.criteria import moves_too_little, stays_behind
+from flashdex.metrics.criteria import (
+    criterion_names,
+    moves_too_little,
+    stays_behind,
+)
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import Rollout, limits_of
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder, remove_own
-from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
+from flashdex.system.jsonl import append_line, check_keys, drop_cut_line, read_lines
 from flashdex.system.names import check_name, check_names, file_stem
 from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
 
 _LOG = logging.getLogger(__name__)
-# what a line holds, of any version
+# what a line holds
 LINE: dict[str, type | tuple[type, ...]] = {
-    "motion": str,
-    "converted": bool,
-    "criterion": str,
-    "errors": dict,
-    "env_steps": int,
-    "wall_s": float,
-}
-# what newer versions, or only some lines, hold besides
-_MORE: dict[str, tuple[type, ...]] = {
-    **dict.fromkeys(("passed", "hands", "why", "trivial"), (list,)),
-    **dict.fromkeys(("frame", "seed"), (int,)),
-    **dict.fromkeys(("rollout", "verdict"), (str, type(None))),
-    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), (str, type(None))),
-    **dict.fromkeys(("lift_ratio", "path_ratio"), (float, int, type(None))),
+    **dict.fromkeys(("motion", "criterion", "engine"), str),
+    **dict.fromkeys(("converted", "completed"), bool),
+    **dict.fromkeys(("env_steps", "frame", "seed"), int),
+    **dict.fromkeys(("wall_s", "gpu_s"), float),
+    **dict.fromkeys(("passed", "hands", "why", "trivial"), list),
+    **dict.fromkeys(("lift_ratio", "path_ratio"), (float, type(None))),
     "certified": (bool, type(None)),
-    "completed": (bool,),
-    "gpu_s": (float, int),
-    "engine": (str,),
+    "errors": dict,
 }
+# and those that store a rollout, besides
+STORED = ("rollout", "verdict", "rollout_sha256", "certificate_sha256")
 
 
 def read_ledger(path: Path) -> list[dict[str, Any]]:
@@ -54,17 +50,12 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
     """
     lines = read_lines(path, LINE)
     for number, line in enumerate(lines, start=1):
-        where = f"{path}: line {number}"
-        check_name(line["motion"], what="motion", where=where)
-        if not math.isfinite(line["wall_s"]):
-            raise RunError(f"{where} has {line['wall_s']} as 'wall_s'.")
-        for key, kinds in _MORE.items():
-            value = line.get(key)
-            if key in line and type(value) not in kinds:
-                raise RunError(
-                    f"{where} has {value!r:.60} as '{key}'. flashdex only adds lines "
-                    "to this file; restore it from a copy."
-                )
+        check_name(line["motion"], what="motion", where=f"{path}: line {number}")
+        more = {key: (str, type(None)) for key in STORED if key in line}
+        check_keys(line, more, path, number)
+        errors = line["errors"]  # of a state that diverged they are not finite
+        odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
+        check_keys(errors, odd, path, number)
     return lines
 
 
@@ -208,9 +199,7 @@ class Ledger(Tally):
                 raise RunError(f"{path}: is the rollout of '{rollout.motion}'.")
             # A later pass replaces the file of an unproven one: compare when it was.
             if line is not None and line["env_steps"] == rollout.env_steps:
-                if "rollout_sha256" in line:
-                    raise RunError(f"{path}: was changed after its line was written.")
-                return False
+                raise RunError(f"{path}: was changed after its line was written.")
             if not rollout.score()[self.criterion].is_passed:
                 return False
             for finding in RolloutCheck(rollout, path.name, None).run():
@@ -228,32 +217,54 @@ class Ledger(Tally):
         return self.path.stat().st_size if self.path.is_file() else 0
 
 
-# what every line holds since runs have an id, and of which one run has one value
-NEWER = ("passed", "trivial", "lift_ratio", "path_ratio", "seed", "engine")
-OF_RUN = ("seed", "engine", "criterion")
+COUNTERS = ("env_steps", "frame", "seed", "wall_s")
+ROUNDED = 1e-6  # m or rad, of the values in a line
 SPEED = "convert/per_hour"  # of a clock that went on between two readings
 SPEED_TOLERANCE = 0.05
 
 
 def line_faults(line: dict[str, Any], of_run: dict[str, Any]) -> list[str]:
-    """What a line of a run with an id lacks, or says against itself or its run."""
-    found = [f"lacks {key!a}" for key in NEWER if key not in line]
-    found += [
-        f"{key} is {line[key]!a:.60}, of the run {of_run[key]!a:.60}"
-        for key in OF_RUN
-        if key in line and key in of_run and line[key] != of_run[key]
+    """What a line says against itself or its run, of which all lines say ``of_run``."""
+    found = [
+        f"{key} is {line[key]!a:.60}, of the run {value!a:.60}"
+        for key, value in of_run.items()
+        if line[key] != value
     ]
-    ratios = {key: line.get(f"{key}_ratio") for key in ("lift", "path")}
-    passes = line["criterion"] in line.get("passed", [])
+    found += [f"{key} is {line[key]}" for key in COUNTERS if line[key] < 0]
+    named, known = [line["criterion"], *line["passed"]], criterion_names()
+    if odd := [name for name in named if name not in known]:
+        return [*found, f"names {odd[0]!a:.60}, which is no criterion"]
+    ratios = {key: line[f"{key}_ratio"] for key in ("lift", "path")}
+    passes = line["criterion"] in line["passed"]
+    if passes and not _is_within(line["errors"], line["criterion"]):
+        found.append("errors are not those of a pass")
     if passes and moves_too_little(ratios) and not is_unmoved(line):
         found.append(f"lacks '{UNMOVED}' in trivial, by its ratios")
     return found
 
 
+def _is_within(errors: dict[str, float], criterion: str) -> bool:
+    """Whether these are the values of a criterion, and those with a most are below."""
+    limits = limits_of(criterion, 0)
+    del limits["grace"]
+    return errors.keys() == limits.keys() and all(
+        value <= limits[name] + ROUNDED
+        for name, value in errors.items()
+        if name not in ("lift", "path")
+    )
+
+
 def count_faults(
-    records: list[dict[str, Any]], lines: list[dict[str, Any]], tally: Tally
+    records: list[dict[str, Any]],
+    lines: list[dict[str, Any]],
+    tally: Tally,
+    *,
+    is_whole: bool,
 ) -> list[str]:
-    """The first record of the metrics that does not count the lines there were."""
+    """The first record of the metrics that does not count the lines there were.
+
+    ``is_whole``: the last one counts all of them.
+    """
     counted = 0
     for number, record in enumerate(records, start=1):
         attempts = record.get("convert/attempts", -1)
@@ -268,4 +279,6 @@ def count_faults(
             if not abs(said - value) <= slack * value + 1e-9:
                 text = f"record {number}: {key} is {said:g}, by the lines {value:g}"
                 return [text]
+    if is_whole and counted != len(lines):
+        return [f"{counted} attempts are counted of {len(lines)} lines"]
     return []

@@ -163,36 +163,21 @@ def model_hash(model: mujoco.MjModel) -> str:
 
 def resimulate(sim: Simulation, *, monitor: StepMonitor | None = None) -> Replay:
     """Apply the controls open loop from the first state; monitor every substep."""
-    model, rollout = sim.model, sim.rollout
-    data = mujoco.MjData(model)
-    data.qpos[:] = sim.qpos0
-    data.qvel[:] = rollout.qvel0
-    if rollout.act0 is not None and model.na:
-        data.act[:] = rollout.act0
-    qpos = np.empty((len(sim.ctrl), model.nq))
-    nan_count, wrench_max = 0, 0.0
-    for t, row in enumerate(sim.ctrl):
-        data.ctrl[:] = row
-        for _ in range(rollout.decimation):
-            mujoco.mj_step(model, data)
-            if monitor is not None:
-                monitor(model, data)
-        qpos[t] = data.qpos
-        nan_count += int(
-            (~np.isfinite(data.qpos)).sum() + (~np.isfinite(data.qvel)).sum()
-        )
-        applied = max(np.abs(data.xfrc_applied).max(), np.abs(data.qfrc_applied).max())
-        wrench_max = max(wrench_max, float(applied))
+    data, states = _step(sim.model, sim.rollout, sim.qpos0, sim.ctrl, monitor=monitor)
+    qpos = states["qpos"]
+    nan_count = sum(int((~np.isfinite(rows)).sum()) for rows in states.values())
+    # nobody applies one: what a step leaves there came with the model
+    wrench_max = max(np.abs(data.xfrc_applied).max(), np.abs(data.qfrc_applied).max())
     warnings = {
         name: int(data.warning[kind].number)
         for name, kind in mujoco.mjtWarning.__members__.items()
         if name.startswith("mjWARN_")
     }
     overflow = any(warnings[name] for name in NUMERIC_WARNINGS) or nan_count > 0
-    states = {**tracked_points(sim, qpos), **object_poses(sim, qpos)}
-    errors = rollout.errors_of(states, overflow=overflow)
-    verdicts = score(errors, grace=rollout.grace)
-    return Replay(qpos, errors, verdicts, warnings, nan_count, wrench_max)
+    points = {**tracked_points(sim, qpos), **object_poses(sim, qpos)}
+    errors = sim.rollout.errors_of(points, overflow=overflow)
+    verdicts = score(errors, grace=sim.rollout.grace)
+    return Replay(qpos, errors, verdicts, warnings, nan_count, float(wrench_max))
 
 
 def tracked_points(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | None]:
@@ -333,15 +318,32 @@ def simulate(
     Returns:
         ``qpos`` (T, nq) and ``qvel`` (T, nv).
     """
+    return _step(model, rollout, rollout.qpos0, rollout.ctrl, single=single)[1]
+
+
+def _step(
+    model: mujoco.MjModel,
+    rollout: Rollout,
+    qpos0: np.ndarray,
+    ctrl: np.ndarray,
+    *,
+    single: bool = False,
+    monitor: StepMonitor | None = None,
+) -> tuple[mujoco.MjData, dict[str, np.ndarray]]:
+    """The last state, and positions and velocities after each control step."""
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = rollout.qpos0, rollout.qvel0
+    data.qpos[:], data.qvel[:] = qpos0, rollout.qvel0
     if rollout.act0 is not None and model.na:
         data.act[:] = rollout.act0
-    out = {"qpos": np.empty_like(rollout.qpos), "qvel": np.empty_like(rollout.qvel)}
-    for t, row in enumerate(rollout.ctrl):
+    steps = len(ctrl)
+    out = {"qpos": np.empty((steps, model.nq)), "qvel": np.empty((steps, model.nv))}
+    for t, row in enumerate(ctrl):
         if single and t:
             data.qpos[:], data.qvel[:] = rollout.qpos[t - 1], rollout.qvel[t - 1]
         data.ctrl[:] = row
-        mujoco.mj_step(model, data, nstep=rollout.decimation)
+        for _ in range(rollout.decimation):
+            mujoco.mj_step(model, data)
+            if monitor is not None:
+                monitor(model, data)
         out["qpos"][t], out["qvel"][t] = data.qpos, data.qvel
-    return out
+    return data, out

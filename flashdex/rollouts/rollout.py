@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_origin, get_type_hints
@@ -232,7 +232,7 @@ class Rollout:
     def load(cls, path: str | Path) -> Rollout:
         """Read and check a file; every fault is a RunError that names the key."""
         data = _read(Path(path))
-        required = {f.name for f in fields(cls) if f.default is MISSING}
+        required = {f.name for f in fields(cls) if f.default is not None}
         absent = sorted(required - data.keys())
         if absent:
             raise RunError(
@@ -346,19 +346,30 @@ def reference_sha256(rollout: Rollout) -> str:
     return found.hexdigest()
 
 
-def limits_of(rollout: Rollout) -> dict[str, Any]:
-    """Grace and limits of the criterion of a rollout, as this version has them."""
-    name = resolve_criterion(rollout.criterion)
-    for criterion in make_criteria(grace=rollout.grace):
-        if name in (criterion.name + s for s in ("", "_left", "_right")):
-            limits = {term.quantity: term.limit for term in criterion.terms}
-            return {"grace": criterion.grace, **limits}
+def limits_of(criterion: str, grace: int) -> dict[str, Any]:
+    """Grace and limits of a criterion, as this version has them."""
+    name = resolve_criterion(criterion)
+    for known in make_criteria(grace=grace):
+        if name in (known.name + s for s in ("", "_left", "_right")):
+            limits = {term.quantity: term.limit for term in known.terms}
+            return {"grace": known.grace, **limits}
     raise AssertionError(name)
+
+
+# what the provenance of a stored rollout says
+PROVENANCE: dict[str, type] = {
+    **dict.fromkeys(("run", "date", "recipe_sha256", "library_sha256"), str),
+    **dict.fromkeys(("motion_sha256", "reference_sha256"), str),
+    **dict.fromkeys(("physics", "limits"), dict),
+}
+# and its versions, those of an engine's own packages besides
+MADE_BY = ("flashdex", "torch", "torchrl", "tensordict", "mujoco", "python")
+MADE_BY += ("engine", "hardware")
 
 
 def bindings_of(rollout: Rollout) -> dict[str, Any]:
     """What the provenance of a rollout says of it."""
     return {
         "reference_sha256": reference_sha256(rollout),
-        "limits": limits_of(rollout),
+        "limits": limits_of(rollout.criterion, rollout.grace),
     }

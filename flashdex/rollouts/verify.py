@@ -6,9 +6,7 @@ a certificate its rollout, a line of the ledger both files, each line the one be
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +14,11 @@ from typing import Any
 from flashdex.errors import FlashdexError, RunError
 from flashdex.metrics.criteria import criterion_names, stays_behind
 from flashdex.metrics.tally import UNMOVED
+from flashdex.recipe import Recipe
 from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.claims import RunClaims, read_json
-from flashdex.rollouts.findings import OLD, Finding, differences
+from flashdex.rollouts.claims import Era, RunClaims
+from flashdex.rollouts.findings import Finding, differences, faults
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
@@ -28,19 +27,15 @@ from flashdex.rollouts.ledger import (
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
-from flashdex.system.files import own_file, own_files
+from flashdex.system.files import own_files
+from flashdex.system.jsonl import read_object
 from flashdex.system.names import file_stem
-from flashdex.system.run_files import (
-    MOTIONS,
-    RECIPE,
-    check_run,
-    read_recipe,
-)
+from flashdex.system.run_files import MOTIONS, RECIPE, SESSIONS, VERSIONS, check_run
 
 CERTIFICATE = ".certificate.json"
-# of a line: what is counted from the rollout it names
+# of a line: what is computed from the rollout it names
 COUNTED = ("motion", "converted", "criterion", "errors", "hands", "frame", "env_steps")
-RATIOS = ("lift_ratio", "path_ratio")
+COUNTED += ("lift_ratio", "path_ratio")
 
 
 @dataclass(frozen=True)
@@ -53,14 +48,9 @@ class Replayed:
     findings: tuple[Finding, ...]  # of rollout, certificate and its line
 
     @property
-    def faults(self) -> list[Finding]:
-        """What is not as it should be."""
-        return [finding for finding in self.findings if finding.is_fault]
-
-    @property
     def holds(self) -> bool:
         """The conversion is proven, and the files say so truthfully."""
-        return not self.faults and self.found in PROVEN
+        return not faults(self.findings) and self.found in PROVEN
 
 
 @dataclass(frozen=True)
@@ -69,6 +59,7 @@ class Verified:
 
     rollouts: list[Replayed]
     ledger: list[Finding]  # of the lines, and of files that no line names
+    eras: list[Era]  # recipes of the run
 
     @property
     def findings(self) -> list[Finding]:
@@ -78,8 +69,7 @@ class Verified:
     @property
     def holds(self) -> bool:
         """Every stored rollout is proven, and the lines are those of the run."""
-        no_fault = not any(finding.is_fault for finding in self.ledger)
-        return no_fault and all(one.holds for one in self.rollouts)
+        return not faults(self.ledger) and all(one.holds for one in self.rollouts)
 
 
 def verify_run(run_dir: str | Path, truth: Truth | None = None) -> Verified:
@@ -111,28 +101,27 @@ class _RunCheck:
     def __init__(self, run_dir: Path, truth: Truth | None) -> None:
         self.run_dir, self.truth = run_dir, truth
         self.claims = RunClaims(run_dir)
+        self._truths: dict[str, Truth | None] = {}  # by the hash of a recipe
 
     def run(self) -> Verified:
         check_run(self.run_dir)  # a link under the name of any file of a run
         files = own_files(self.run_dir, ROLLOUTS, "*.npz")
-        lines = self.claims.lines()
+        lines = self.claims.lines(self.truth and self.truth.bank.names)
         told = {x["motion"]: x for x in lines if x.get("rollout")}  # the newest
-        if not files and not told:
-            raise RunError(
-                f"{self.run_dir}: no stored rollout in '{ROLLOUTS}/'. Either nothing "
-                "has been converted yet, or this is not a run directory."
-            )
         names = {file.name for file in files}
         for motion in told:
             if Path(rollout_name(motion)).name not in names:
                 self.claims.fault(motion, f"its {rollout_name(motion)} is missing")
-        found = [self._one(file, told) for file in files]
         for path in own_files(self.run_dir, ROLLOUTS, f"*{CERTIFICATE}"):
             if path.name.removesuffix(CERTIFICATE) + ".npz" not in names:
                 self.claims.fault("certificate", "of no rollout", file=self._name(path))
-        if self.claims.is_bound:
-            found = [replace(one, findings=_too_old(one.findings)) for one in found]
-        return Verified(found, self.claims.findings)
+        if not (files or told or faults(self.claims.findings)):
+            raise RunError(
+                f"{self.run_dir}: no stored rollout in '{ROLLOUTS}/'. Either nothing "
+                "has been converted yet, or this is not a run directory."
+            )
+        found = [self._one(file, told) for file in files]
+        return Verified(found, self.claims.findings, self.claims.eras)
 
     def _name(self, path: Path) -> str:
         return f"{ROLLOUTS}/{path.name}"
@@ -146,72 +135,89 @@ class _RunCheck:
             line = next((x for m, x in told.items() if file_stem(m) == stem), {})
             fault = Finding(file, "file", str(error))
             return Replayed(stem, line.get("verdict"), "not_measured", (fault,))
-        found = self._bound(rollout, file)
-        check = RolloutCheck(
-            rollout,
-            file,
-            self.truth,
-            is_current=all(f.is_fault or f.what != "recipe" for f in found),
-        )
+        line = told.get(rollout.motion)
+        said = json.loads(rollout.provenance)
+        recipe = said.get("recipe_sha256")
+        truth, found = self._recipe(recipe, rollout.hand, file, line)
+        found += self._bound(rollout, said, file, truth)
+        check = RolloutCheck(rollout, file, truth)
         found += check.run()
         if file != rollout_name(rollout.motion):
             found.append(Finding(file, "motion", f"is that of '{rollout.motion}'"))
         verdict, stored, compared = self._certificate(path, rollout, check)
-        line = told.get(rollout.motion)
         found += compared
         if check.is_sound:
             found += self._told(line, path, rollout, stored)
         return Replayed(rollout.motion, stored.get("verdict"), verdict, tuple(found))
 
-    def _bound(self, rollout: Rollout, file: str) -> list[Finding]:
-        """Recipe, library and motion that the rollout was made by."""
-        said, found = json.loads(rollout.provenance), []
-        if "reference_sha256" not in said:
-            found.append(Finding(file, "hashes", OLD, is_fault=False))
-        if "recipe_sha256" in said and (self.run_dir / RECIPE).exists():
-            sha = self._recipe_sha256()
-            if said["recipe_sha256"] != sha:
-                changed = self.claims.was_overridden()
-                text = "recipe.yaml is another than it was made by"
-                text += ", as --resume changed it" if changed else ""
-                found.append(Finding(file, "recipe", text, is_fault=not changed))
-        known = self.claims.motions.get(rollout.motion)
-        if self.claims.motions and said.get("motion_sha256", known) != known:
-            text = f"the motion is another than that of {MOTIONS}"
-            found.append(Finding(file, "motion", text))
-        if self.truth is None:
-            return found
-        library = self.truth.library
-        # older versions named a file's hash, of libraries that are not read any more
-        is_bound = "reference_sha256" in said
-        if is_bound and said.get("library_sha256") != library.content_hash:
-            text = f"{library.path} is another than it was made from"
-            found.append(Finding(file, "library", text))
-        names = self.truth.bank.names
-        if "motion_sha256" in said and rollout.motion in names:
-            sha = library.motion_hash(names.index(rollout.motion))
-            if said["motion_sha256"] != sha:
-                text = "the library has another motion of that name"
-                found.append(Finding(file, "motion", text))
-        return found
+    def _recipe(
+        self, sha256: Any, hand: str, file: str, line: dict[str, Any] | None
+    ) -> tuple[Truth | None, list[Finding]]:
+        """Library and the recipe that a rollout was made by, which one of the run's."""
+        era = self.claims.era_of(sha256)
+        if era is None:
+            text = f"is none of those that {RECIPE} and {SESSIONS} hold"
+            return self.truth, [Finding(file, "recipe", text)]
+        found = []
+        if hand != era.plain.get("hand"):
+            found.append(Finding(file, "hand", f"is another than that of {RECIPE}"))
+        if line is not None and not era.holds(line["wall_s"]):
+            found.append(Finding(file, "recipe", "is that of another time of the run"))
+        now = self.truth
+        if now is None or era is self.claims.eras[-1]:
+            return now, found
+        recipe = era.recipe
+        if (
+            not isinstance(recipe, Recipe)
+            or recipe.hand != now.recipe.hand
+            or recipe.motions != now.recipe.motions
+        ):
+            text = "of an earlier recipe, whose library is not at hand"
+            return None, [*found, Finding(file, "library", text, is_fault=False)]
+        if sha256 not in self._truths:
+            self._truths[sha256] = replace(now, recipe=recipe)
+        return self._truths[sha256], found
 
-    def _recipe_sha256(self) -> str:
-        try:
-            recipe = read_recipe(self.run_dir)
-        except RunError:
-            return ""  # of no recipe
-        return hashlib.sha256(recipe.encode()).hexdigest()
+    def _bound(
+        self, rollout: Rollout, said: dict[str, Any], file: str, truth: Truth | None
+    ) -> list[Finding]:
+        """Run, library and motion that the rollout was made by."""
+        name = rollout.motion
+        known: dict[tuple[str, str], Any] = {
+            ("run", f"that of {VERSIONS}"): self.claims.run,
+            ("motion_sha256", f"that of {MOTIONS}"): self.claims.motions.get(name),
+        }
+        if truth is not None:
+            library, names = truth.library, truth.bank.names
+            known["library_sha256", str(library.path)] = library.content_hash
+            if name in names:
+                sha = library.motion_hash(names.index(name))
+                known["motion_sha256", "that of the library"] = sha
+        found = [
+            Finding(file, key, f"is another than {of}: it was made from another")
+            for (key, of), right in known.items()
+            if said.get(key) != right
+        ]
+        if not self.claims.is_of_session(said.get("date")):
+            found.append(Finding(file, "date", "is of no session of the run"))
+        made_by = json.loads(rollout.versions)
+        return found + [
+            Finding(file, "versions", f"{key} is not {right!a}, as {VERSIONS} says")
+            for key, right in self.claims.made_by.items()
+            if not str(made_by.get(key)).endswith(right)  # a GPU stands before it
+        ]
 
     def _certificate(
         self, path: Path, rollout: Rollout, check: RolloutCheck
     ) -> tuple[str, dict[str, Any], list[Finding]]:
         """Verdict of a new certificate, the stored one, and where they differ."""
-        file = own_file(self.run_dir, ROLLOUTS, path.stem + CERTIFICATE)
-        name, stored = self._name(file), {}
+        file = path.stem + CERTIFICATE
+        name, stored = f"{ROLLOUTS}/{file}", {}
         found: list[Finding] = []
-        if file.is_file():
-            stored, fault = read_json(file)
-            found += [Finding(name, "file", fault)] if fault else []
+        try:
+            stored = read_object(self.run_dir, ROLLOUTS, file, sealed=False)
+        except RunError as error:
+            found.append(Finding(name, "file", str(error)))
         if check.model is None or faults(check.findings):
             # it is not what it says; what a replay of it would prove is nothing
             return "not_measured", stored, found
@@ -239,34 +245,29 @@ class _RunCheck:
             text = f"criterion {line['criterion']!a} is none"
             return [Finding(CONVERSIONS, file, text)]
         expected = rollout.summary(line["criterion"])
-        pairs = [(key, line.get(key), expected[key]) for key in COUNTED]
-        new = "rollout_sha256" in line
-        pairs += [(key, line.get(key), expected[key]) for key in RATIOS if new]
-        if new:
-            has = UNMOVED in (line.get("trivial") or [])
-            unmoved = stays_behind(rollout.tracking_errors())
-            pairs.append((f"trivial.{UNMOVED}", has, unmoved))
-        pairs.append(("seed", line.get("seed"), rollout.seed))
-        if self.claims.is_bound:
-            said, found = (_without_end(x.get("passed", [])) for x in (line, expected))
-            pairs.append(("passed", said, found))
-            made_by = json.loads(rollout.versions).get("engine")
-            pairs.append(("engine", line.get("engine"), made_by))
-            pairs.append(("criterion", line["criterion"], rollout.criterion))
-        pairs.append(("verdict", line.get("verdict"), stored.get("verdict")))
-        is_proven = stored.get("verdict") in PROVEN if stored else None
-        if "verdict" in line or stored:
-            pairs.append(("certified", line.get("certified"), is_proven))
-        certificate = path.with_name(path.stem + CERTIFICATE)
-        hashes = {"rollout_sha256": path, "certificate_sha256": certificate}
-        found = []
-        for key, other in hashes.items():
-            if not new:
-                found.append(Finding(CONVERSIONS, f"{key} of {file}", OLD, False))
-            elif other.is_file() or key in line:
-                sha = hash_content(other) if other.is_file() else None
-                pairs.append((key, line.get(key), sha))
-        return found + [
+        pairs = [(key, line[key], expected[key]) for key in COUNTED]
+        said, found = (_without_end(x["passed"]) for x in (line, expected))
+        verdict = stored.get("verdict")
+        hashes = {"rollout_sha256": path}
+        hashes["certificate_sha256"] = path.with_name(path.stem + CERTIFICATE)
+        pairs += [
+            ("passed", said, found),
+            (
+                f"trivial.{UNMOVED}",
+                UNMOVED in line["trivial"],
+                stays_behind(rollout.tracking_errors()),
+            ),
+            ("seed", line["seed"], rollout.seed),
+            ("engine", line["engine"], json.loads(rollout.versions).get("engine")),
+            ("criterion", line["criterion"], rollout.criterion),
+            ("verdict", line.get("verdict"), verdict),
+            ("certified", line["certified"], verdict in PROVEN if verdict else None),
+            *(
+                (key, line.get(key), hash_content(other) if other.is_file() else None)
+                for key, other in hashes.items()
+            ),
+        ]
+        return [
             Finding(CONVERSIONS, f"{file}: {text.split(' ')[0]}", text)
             for key, said, right in pairs
             for text in differences(said, right, at=key, tolerance=2e-6)
@@ -276,16 +277,3 @@ class _RunCheck:
 def _without_end(passed: list[Any]) -> list[Any]:
     """Criteria but that of terminations, which a file does not hold."""
     return [name for name in passed if not str(name).startswith("completed")]
-
-
-def _too_old(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Those of a run that has an id: what it does not bind was taken out of it."""
-    text = "is not bound, in a run of a version that binds it"
-    return tuple(
-        replace(f, text=text, is_fault=True) if f.text == OLD else f for f in findings
-    )
-
-
-def faults(findings: Iterable[Finding]) -> list[Finding]:
-    """Those that are not only unchecked."""
-    return [finding for finding in findings if finding.is_fault]

@@ -36,8 +36,6 @@ def seal(text: str, before: str) -> str:
 def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]:
     """Read a JSONL file, the seals left out; what a crash cut off is left out as well.
 
-    Lines of versions before the seals may stand before the first sealed one.
-
     Args:
         path: of the file; one that is not there has no lines.
         schema: what every line has to hold.
@@ -49,25 +47,19 @@ def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]
     whole = content[: _whole(content)]
     if len(whole) < len(content):
         _LOG.warning("%s: its last line is not whole and is left out", path)
-    out, before, sealed, position = [], "", False, 0
+    out: list[dict[str, Any]] = []
+    before = ""
     for number, raw in enumerate(whole.split(b"\n")[:-1], start=1):
-        length = len(raw) + 1
         found = SEAL.search(raw)
-        if found is None and sealed:
-            raise _fault(path, number, "has no seal, the one before it has one")
-        if found is not None:
-            if not sealed:  # the first one binds all that stood there before
-                before = hashlib.sha256(whole[:position]).hexdigest() if out else ""
-            sealed, body = True, raw[: found.start()] + b"}"
-            expected = hashlib.sha256(before.encode() + body).hexdigest()
-            before = found.group(1).decode()
-            if before != expected:
-                raise _fault(path, number, "was changed, or one before it is missing")
-            raw = body
-        out.append(_parse(path, number, raw))
-        position += length
-    for number, line in enumerate(out, start=1):
-        check_keys(line, schema or {}, path, number)
+        if found is None:
+            raise _fault(path, number, "has no seal")
+        body = raw[: found.start()] + b"}"
+        expected = hashlib.sha256(before.encode() + body).hexdigest()
+        before = found.group(1).decode()
+        if before != expected:
+            raise _fault(path, number, "was changed, or one before it is missing")
+        out.append(_parse(path, number, body))
+        check_keys(out[-1], schema or {}, path, number)
     return out
 
 
@@ -120,7 +112,7 @@ def check_keys(
             raise _fault(path, number, f"has {value!r:.60} as '{key}'")
 
 
-def _fault(path: Path, number: int, what: str) -> RunError:
+def _fault(path: Path, number: int | str, what: str) -> RunError:
     return RunError(
         f"{path}: line {number} {what}. flashdex only adds lines to this file; restore "
         "it from a copy."
@@ -132,6 +124,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
 
     Raises:
         OSError: the disk refuses, or a link stands there; the file is as it was.
+        RunError: its last line has no seal.
     """
     with open_plain(path, "ab") as file:
         size = file.tell()
@@ -151,10 +144,9 @@ def _last_seal(path: Path, size: int) -> str:
     with open_plain(path) as file:
         file.seek(max(0, size - SEAL_BYTES - 1))
         found = SEAL.search(file.read().removesuffix(b"\n"))
-        if found is not None:
-            return found.group(1).decode()
-        file.seek(0)
-        return hashlib.sha256(file.read(size)).hexdigest()
+    if found is None:
+        raise _fault(path, "at the end", "has no seal")
+    return found.group(1).decode()
 
 
 def drop_cut_line(path: Path) -> None:
@@ -197,8 +189,13 @@ def write_object(content: dict[str, Any], root: Path, *parts: str) -> None:
         file.write(text.encode("utf-8") + b"\n")
 
 
-def read_object(root: Path, *parts: str) -> dict[str, Any]:
+def read_object(root: Path, *parts: str, sealed: bool = True) -> dict[str, Any]:
     """A JSON object of a run, its seal left out; one that is not there is empty.
+
+    Args:
+        root: folder of the run.
+        parts: of the path below it.
+        sealed: it was written by ``write_object``.
 
     Raises:
         RunError: it is damaged, was changed, or is something else.
@@ -213,9 +210,10 @@ def read_object(root: Path, *parts: str) -> dict[str, Any]:
         raise RunError(f"{path}: not JSON ({error}). Restore or remove it.") from error
     if not isinstance(found, dict):
         raise RunError(f"{path}: not a JSON object. Restore or remove it.")
-    is_sealed = found.pop("sealed", None) is not None
-    is_sealed |= found.pop("sha256", None) is not None
-    if is_sealed and seal(text[:-SEAL_BYTES] + "}", "") != text:
+    if not sealed:
+        return found
+    del_keys = [found.pop(key, None) for key in ("sealed", "sha256")]
+    if None in del_keys or seal(text[:-SEAL_BYTES] + "}", "") != text:
         raise RunError(
             f"{path}: was changed or damaged since flashdex wrote it. Restore or "
             "remove it."

@@ -60,9 +60,14 @@ FOLDERS = {  # -> names of its files; what else lies there is nobody's business
 # a folder with one of them holds a run, or what is left of one
 TRACES = (RECIPE, SESSIONS, CONVERSIONS, METRICS, BASELINES, CHECKPOINTS)
 _HALF = re.compile(r"\.(.+)\.\d+\.tmp")  # what a killed process left half written
+_ID = re.compile(r"[0-9a-f]{32}")
 _COUNTERS: Schema = {"env_steps": int, "wall_s": float}
-STARTED: Schema = {**_COUNTERS, "env_steps_lost": int, "overrides": list, "date": str}
-ENDED: Schema = {**_COUNTERS, "why": str, "date": str}
+STARTED: Schema = {
+    **_COUNTERS,
+    **{"env_steps_lost": int, "overrides": list, "date": str, "run": str},
+    "before": str,  # recipe of the session before, where the overrides changed it
+}
+ENDED: Schema = {**_COUNTERS, "why": str, "date": str, "lines": dict}
 
 
 def rollout_name(motion: str) -> str:
@@ -212,9 +217,6 @@ def read_recipe(run_dir: Path) -> str:
     body = text[: text.rfind("# sha256 of the lines above: ")]
     if seal_text(body) == text:
         return body
-    # runs of versions before the seals have no id, either
-    if body == text[:-1] and "run" not in read_object(run_dir, VERSIONS):
-        return text
     raise RunError(
         f"{run_dir / RECIPE}: was changed or damaged since flashdex wrote it. Restore "
         "it (every checkpoint holds a copy), and give new values to --resume as "
@@ -243,15 +245,19 @@ def require_run(path: Path, *, or_library: bool = False) -> None:
 
 
 def run_id(run_dir: Path) -> str:
-    """What tells a run from every other one; empty for those of older versions.
+    """What tells a run from every other one.
 
     Raises:
-        RunError: the file that says so is damaged.
+        RunError: the file that says so is missing, damaged, or of another version.
     """
-    found = read_object(run_dir, VERSIONS).get("run", "")
-    if not isinstance(found, str):
-        raise RunError(f"{run_dir / VERSIONS}: 'run' is not text. Restore the file.")
-    return found
+    found = read_object(run_dir, VERSIONS).get("run")
+    if isinstance(found, str) and _ID.fullmatch(found):
+        return found
+    raise RunError(
+        f"{run_dir / VERSIONS}: does not say which run this is, as the 32 digits of "
+        "'run'. Restore it from a copy. Runs of versions that gave none cannot be read "
+        "any more; train again."
+    )
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
@@ -281,8 +287,12 @@ def read_sessions(run_dir: Path) -> list[dict[str, Any]]:
     path = own_file(run_dir, SESSIONS)
     lines = read_lines(path, {"event": str})
     for number, line in enumerate(lines, start=1):
-        schema = {"start": STARTED, "end": ENDED}.get(line["event"], {})
+        schema = STARTED if line["event"] == "start" else ENDED
         check_keys(line, schema, path, number)
+        counts, words = line.get("lines", {}), line.get("overrides", [])
+        check_keys(counts, dict.fromkeys(counts, int), path, number)
+        named = {f"overrides[{i}]": word for i, word in enumerate(words)}
+        check_keys(named, dict.fromkeys(named, str), path, number)
     return lines
 
 
@@ -305,8 +315,8 @@ def check_sessions(run_dir: Path, *, counts: bool = True) -> None:
         RunError: lines are missing, or ``versions.json`` is another run's.
     """
     lines = read_sessions(run_dir)
-    begun = next((x for x in reversed(lines) if x["event"] == "start"), {})
-    if begun.get("run", "") not in ("", run_id(run_dir)):
+    own = run_id(run_dir)
+    if any(x["event"] == "start" and x["run"] != own for x in lines):
         raise RunError(
             f"{run_dir / VERSIONS}: is not that of this run, or is missing. Restore it "
             "from a copy."

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+import random
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,18 @@ from torch import Tensor
 
 from flashdex.envs.scene.scene import SceneLayout
 from flashdex.envs.tracking import TrackingEnv
+from flashdex.errors import RunError
 from flashdex.metrics.criteria import criterion_names, score
 from flashdex.metrics.criteria_table import Verdict
 from flashdex.metrics.errors import frozen_object
 from flashdex.motions.library_format import hash_json
+from flashdex.recipe import Recipe
 from flashdex.rollouts.build import grace_steps
-from flashdex.system.files import open_plain, write_atomic
+from flashdex.rollouts.findings import Finding, at, differences
+from flashdex.system.jsonl import read_object, write_object
+from flashdex.system.machine import versions
+from flashdex.system.run_files import BASELINES as FILE
+from flashdex.system.run_files import VERSIONS
 from flashdex.training.build import RunBuilder
 from flashdex.training.evaluator import roll_all
 
@@ -67,18 +73,22 @@ SEAL = "sha256"
 NO_MATTER = {"compile", "num_envs", "rsi", "sampler", "attempt_share", "assist"}
 NO_MATTER |= {"reset_noise", "reset_hold_s", "reset_hold_stiffness"}
 NO_MATTER |= {"transforms", "rewards", "terminations", "reference_offset"}
-MAX_BYTES = 256 << 20  # of the file of a run
+RECOMPUTED = 8  # motions whose baselines a verification scores again
 _LOG = logging.getLogger(__name__)
 
 
-def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
-    """Roll and score all baselines on all motions.
+def score_baselines(
+    builder: RunBuilder, path: Path | None = None, *, only: Collection[str] = ()
+) -> Baselines:
+    """Roll and score all baselines on all motions, or ``only`` on those named.
 
     What the file of this run knows is reused, motion by motion: of the same content, by
     the same physics. A row that was edited is scored again.
     """
     known = {} if path is None else _read_known(path)
     inputs = _inputs(builder)
+    rows_of = {name: row for row, name in enumerate(inputs)}
+    inputs = {name: inputs[name] for name in only or inputs}
     joints = builder.bank.num_joints
 
     def idle(td: TensorDictBase, env: TrackingEnv) -> Tensor:
@@ -92,7 +102,7 @@ def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
             for motion, made_of in inputs.items()
             if _is_sealed(old.get(motion), made_of)
         }
-        todo = [row for row, motion in enumerate(inputs) if motion not in mine]
+        todo = [rows_of[motion] for motion in inputs if motion not in mine]
         if name == FROZEN:
             mine |= _score_frozen(builder, todo)
         else:
@@ -100,22 +110,52 @@ def score_baselines(builder: RunBuilder, path: Path | None = None) -> Baselines:
                 mine[rollout.motion] = _row(builder, rollout.score())
         rows[name] = {m: _sealed(mine[m], made_of) for m, made_of in inputs.items()}
     if path is not None and rows != known:
-        write_atomic(path, json.dumps(rows, indent=1))
+        write_object(rows, path.parent, path.name)
     return Baselines(rows)
+
+
+def check_baselines(
+    builder: RunBuilder, run_dir: Path, former: Sequence[Recipe]
+) -> list[Finding]:
+    """Where the scores of a run are not those that are computed now.
+
+    Of at most ``RECOMPUTED`` motions, chosen by the content of the library, where the
+    same engine, MuJoCo and processor are at hand. A resume that was killed leaves those
+    of one of the ``former`` recipes.
+    """
+    engine = builder.recipe.physics.engine
+    said, here = read_object(run_dir, VERSIONS), versions(engine)
+    if engine != "cpu" or any(said.get(k) != here[k] for k in ("mujoco", "hardware")):
+        text = "are of another engine, MuJoCo or computer, and not computed again"
+        return [Finding(FILE, "scores", text, is_fault=False)]
+    stored, names = read_object(run_dir, FILE), builder.bank.names
+    chosen = random.Random(builder.library.content_hash).sample(
+        sorted(names), min(RECOMPUTED, len(names))
+    )
+    found, before = [], [_inputs(replace(builder, recipe=r)) for r in former]
+    for name, motions in score_baselines(builder, only=chosen).rows.items():
+        for motion, row in motions.items():
+            said = at(stored, name, motion)
+            texts = differences(said, row, at=f"{name}.{motion}")
+            if texts and any(_is_sealed(said, inputs[motion]) for inputs in before):
+                text = "of motions by an earlier recipe"
+                found.append(Finding(FILE, "scores", text, is_fault=False))
+                continue
+            found += [Finding(FILE, name, text) for text in texts]
+    if len(names) > len(chosen):
+        text = f"of {len(names) - len(chosen)} of {len(names)} motions"
+        found.append(Finding(FILE, "scores", text, is_fault=False))
+    return found
 
 
 def _read_known(path: Path) -> dict[str, Any]:
     """Scores of an earlier session; nothing where they cannot be read."""
     try:
-        with open_plain(path) as file:
-            known = json.loads(file.read(MAX_BYTES).decode("utf-8"))
-    except FileNotFoundError:
+        known = read_object(path.parent, path.name)
+    except RunError as error:
+        _LOG.warning("%s Baselines are scored again", error)
         return {}
-    except (OSError, ValueError, RecursionError) as error:
-        _LOG.warning("%s: cannot be read (%s); baselines are scored again", path, error)
-        return {}
-    tables = known.items() if isinstance(known, dict) else ()
-    return {name: table for name, table in tables if isinstance(table, dict)}
+    return {name: table for name, table in known.items() if isinstance(table, dict)}
 
 
 def _inputs(builder: RunBuilder) -> dict[str, str]:

@@ -18,9 +18,9 @@ from flashdex.algorithms.base import Learner
 from flashdex.errors import FlashdexError, RunError
 from flashdex.motions.library import verify_library
 from flashdex.motions.library_format import MANIFEST
-from flashdex.recipe import Recipe, RunRecipe, expect_kind
+from flashdex.recipe import Recipe, RunRecipe, expect_kind, parse_recipe
 from flashdex.replay.disk import check_rows
-from flashdex.rollouts.findings import Finding
+from flashdex.rollouts.findings import Finding, faults
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.truth import Truth
@@ -42,9 +42,12 @@ from flashdex.system.run_files import (
     check_sessions,
     read_metrics,
     read_recipe,
+    read_sessions,
     require_run,
     rollout_name,
+    run_id,
 )
+from flashdex.training.baselines import check_baselines
 from flashdex.training.build import RunBuilder
 from flashdex.training.checkpoint import (
     check_format,
@@ -57,9 +60,17 @@ from flashdex.training.run_dir import load_learner, load_run_recipe
 
 
 def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
-    """Recipe and library of a run, to verify its rollouts against.
+    """Recipe and library of a run, to verify its rollouts against; see below."""
+    builder, why = _open_builder(run_dir)
+    return builder and _truth(builder), why
 
-    Nothing is prepared.
+
+def _truth(builder: RunBuilder) -> Truth:
+    return Truth(builder.recipe, builder.library, builder.hands, builder.bank)
+
+
+def _open_builder(run_dir: str | Path) -> tuple[RunBuilder | None, str]:
+    """What builds the parts of a run; nothing is prepared.
 
     Returns:
         None, and why, where the library is not at hand.
@@ -68,10 +79,9 @@ def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
         recipe = expect_kind(load_run_recipe(Path(run_dir)), Recipe, where=str(run_dir))
         if find_library(recipe) is None:
             return None, "the library that recipe.yaml names is not here"
-        builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
+        return RunBuilder.from_recipe(recipe, device=torch.device("cpu")), ""
     except FlashdexError as error:
         return None, str(error)
-    return Truth(recipe, builder.library, builder.hands, builder.bank), ""
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ class Verification:
     @property
     def holds(self) -> bool:
         """Nothing differs."""
-        return not any(finding.is_fault for finding in self.findings)
+        return not faults(self.findings)
 
 
 def verify(path: str | Path) -> Verification:
@@ -109,17 +119,21 @@ def verify(path: str | Path) -> Verification:
         return _verify_library(path)
     require_run(path, or_library=True)
     files, findings = read_all_files(path)
-    truth, why = open_truth(path)
+    builder, why = _open_builder(path)
     try:
-        verified = verify_run(path, truth)
+        verified = verify_run(path, builder and _truth(builder))
+        if builder is not None and not faults(verified.ledger):
+            recipes = [era.recipe for era in verified.eras[:-1]]
+            former = [recipe for recipe in recipes if isinstance(recipe, Recipe)]
+            findings += check_baselines(builder, path, former)
     except RunError as error:
         if (path / CONVERSIONS).exists():
             findings.append(Finding(CONVERSIONS, "rollouts", str(error), False))
-        verified = Verified([], [])
+        verified = Verified([], [], [])
     for one in verified.rollouts:
         if one.holds:
             files.append(f"{rollout_name(one.motion)}, {one.found}")
-        elif not one.faults:
+        elif not faults(one.findings):
             text = f"is {one.found}, no proof"
             findings.append(Finding(rollout_name(one.motion), "certificate", text))
     return Verification(path, files, [*findings, *verified.findings], why)
@@ -145,8 +159,9 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
         DUMP: lambda: read_dump(run_dir / DUMP),
         **{
             name: partial(read_object, run_dir, name)
-            for name in (VERSIONS, BASELINES, MOTIONS, EVALUATION)
+            for name in (BASELINES, MOTIONS, EVALUATION)
         },
+        VERSIONS: partial(run_id, run_dir),
     }
     files: list[str] = []
     findings: list[Finding] = []
@@ -172,7 +187,19 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
 
 
 def _check_checkpoint(run_dir: Path, path: Path) -> None:
-    check_format(read_checkpoint(run_dir, path.name), path)
+    state = read_checkpoint(run_dir, path.name)
+    check_format(state, path, ("run", "recipe"))
+    sessions = read_sessions(run_dir)
+    recipes = [read_recipe(run_dir), *(line.get("before") for line in sessions)]
+    known = [parse_recipe(text, where=RECIPE) for text in recipes if text]
+    last = sessions[-1] if sessions else {}
+    is_later = last.get("event") == "end" and state["env_steps"] > last["env_steps"]
+    if (
+        state["run"] != run_id(run_dir)
+        or parse_recipe(state["recipe"], where=str(path)) not in known
+        or is_later
+    ):
+        raise RunError(f"{path}: is that of another run, or of another time of it.")
 
 
 class RunPolicy(TensorDictModuleBase):

@@ -186,7 +186,7 @@ def _load_state(run_dir: Path, needs: Collection[str]) -> dict[str, Any]:
         RunError: see ``load_checkpoint``; or it was made by another run.
     """
     state, own = load_checkpoint(run_dir, needs), run_id(run_dir)
-    if state.get("run", own) != own:
+    if state.get("run") != own:
         raise RunError(
             f"{run_dir / CHECKPOINTS}: its newest checkpoint was made by another run "
             "than this one. Move it away to go on from the one before."
@@ -265,15 +265,16 @@ def make_trainer(
     learner = task.make_learner(env)
     if state is not None:
         restore(learner, state, worlds_key=task.worlds_key)
-    if changed:
-        write_recipe(run_dir, dump_recipe(task.recipe))
-    task.prepare(run_dir, env)
     start = begin_session(
         run_dir,
         env_steps=state["env_steps"] if state else 0,
         wall_s=state["wall_s"] if state else 0.0,
         overrides=overrides or [],
+        before=read_recipe(run_dir) if changed else "",
     )
+    if changed:  # after the line that keeps the one before
+        write_recipe(run_dir, dump_recipe(task.recipe))
+    task.prepare(run_dir, env)
     log = MetricLog(
         run_dir,
         task.recipe,

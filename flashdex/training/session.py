@@ -39,22 +39,28 @@ class SessionStart:
     env_steps: int  # of the checkpoint, 0 without one
     wall_s: float  # s of the run so far, those after the checkpoint included
     lost: int  # env steps of all sessions that no checkpoint kept
-    run: str = ""  # what tells the run from others; empty in those of older versions
+    run: str  # what tells the run from others
 
 
 def begin_session(
-    run_dir: Path, *, env_steps: int, wall_s: float, overrides: list[str]
+    run_dir: Path,
+    *,
+    env_steps: int,
+    wall_s: float,
+    overrides: list[str],
+    before: str = "",
 ) -> SessionStart:
     """Work out where a session begins and write its ``start`` line.
 
     The counters go back to the checkpoint. The clock does not: it goes on from the
     latest moment that any file of the run knows of. Env steps beyond the checkpoint
-    were simulated for nothing and are added up.
+    were simulated for nothing and are added up. ``before`` is the recipe, YAML, that
+    the overrides change.
     """
     path = own_file(run_dir, SESSIONS)
     drop_cut_line(path)
-    before = [s for s in read_sessions(run_dir) if s["event"] == "start"]
-    since = before[-1]["wall_s"] if before else 0.0
+    starts = [s for s in read_sessions(run_dir) if s["event"] == "start"]
+    since = starts[-1]["wall_s"] if starts else 0.0
     seen = _seen(run_dir)
     # What an earlier resume has counted already was written before that resume.
     reached = [steps for steps, wall in seen if wall > since]
@@ -62,7 +68,7 @@ def begin_session(
     start = SessionStart(
         env_steps=env_steps,
         wall_s=max([wall_s, since, *(wall for _, wall in seen)]),
-        lost=lost + (before[-1]["env_steps_lost"] if before else 0),
+        lost=lost + (starts[-1]["env_steps_lost"] if starts else 0),
         run=run_id(run_dir),
     )
     line = {
@@ -73,6 +79,7 @@ def begin_session(
         "env_steps_lost": start.lost,
         "overrides": overrides,
         "run": start.run,
+        "before": before,
     }
     append_line(path, line)
     return start

@@ -29,7 +29,7 @@ from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, Scorer
 from flashdex.system.files import own_file
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.machine import versions
-from flashdex.system.run_files import BASELINES, MOTIONS
+from flashdex.system.run_files import BASELINES, MOTIONS, run_id
 from flashdex.training.baselines import score_baselines
 from flashdex.training.build import RunBuilder, learner_device
 from flashdex.training.checkpoint import EVALUATED, RESUMED
@@ -82,7 +82,7 @@ class TrackingTask(Task):
 
     @cached_property
     def provenance(self) -> dict[str, str]:
-        """Where a rollout comes from, apart from the versions stored with it."""
+        """What a rollout of any run of it comes from."""
         recipe = dump_recipe(self.recipe).encode()
         return {
             "recipe_sha256": hashlib.sha256(recipe).hexdigest(),
@@ -164,10 +164,11 @@ class TrackingTask(Task):
         """In the loop, or in a process where the physics would wait for it."""
         recipe, env = self.recipe, self.env
         made_by = versions(recipe.physics.engine, env.device)
+        provenance = {**self.provenance, "run": run_id(self.run_dir)}
         where = recipe.train.judge
         if where == "inline" or (where == "auto" and env.is_host_device):
             builder = self.builder.rollout_builder(
-                env.physics.scenes, made_by=made_by, provenance=self.provenance
+                env.physics.scenes, made_by=made_by, provenance=provenance
             )
             return InlineScorer(self.ledger, builder)
         # The process must not prepare the motions again: name the library in use.
@@ -177,7 +178,7 @@ class TrackingTask(Task):
             dataclasses.replace(recipe, motions=motions),
             self.run_dir,
             made_by,
-            self.provenance,
+            provenance,
             self.ledger.trivial,
             self.ledger.on_gpu,
         )

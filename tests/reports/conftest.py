@@ -1,6 +1,5 @@
 """A run directory: a rollout stepped by MuJoCo C, and lines as training writes them."""
 
-import json
 import math
 import re
 
@@ -10,6 +9,8 @@ from pushed_box import make_rollout
 
 from flashdex.cli.main import main
 from flashdex.rollouts.certificate import certify
+from flashdex.system.jsonl import write_lines, write_object
+from flashdex.system.run_files import write_recipe
 
 EVIL = '<script>alert("x")</script> & co'
 
@@ -43,10 +44,6 @@ def attempt(motion, env_steps, *, wall_s=60.0, converted=False, errors=None, why
     }
 
 
-def write_lines(path, lines):
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-
-
 @pytest.fixture
 def empty_run(tmp_path):
     """A run that has just begun: a recipe and versions, nothing else."""
@@ -61,9 +58,9 @@ def empty_run(tmp_path):
         "physics": {"engine": "cpu"},
         "train": {"criterion": "sr_mt_obj", "render_conversions": False},
     }
-    (run / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    write_recipe(run, yaml.safe_dump(recipe))
     versions = {"flashdex": "0.1.0", "mujoco": "4.0", "hardware": "8 cores, no GPU"}
-    (run / "versions.json").write_text(json.dumps(versions))
+    write_object({"run": "0" * 32, **versions}, run, "versions.json")
     return run
 
 
@@ -131,7 +128,7 @@ def run_dir(empty_run, rollout, certificate):
         "do_nothing": {"push": failed, EVIL: failed, "turn": failed},
         "kinematic_playback": {"push": scored, EVIL: failed, "turn": failed},
     }
-    (run / "baselines.json").write_text(json.dumps(baselines))
+    write_object(baselines, run, "baselines.json")
     return run
 
 

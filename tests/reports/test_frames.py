@@ -19,6 +19,7 @@ from flashdex.reports.render.rollout import HEIGHT, WIDTH, Painter, write_film
 from flashdex.reports.render.scene import MARGIN, fit_view, view_axes
 from flashdex.reports.run.report import write_report
 from flashdex.system.names import file_stem
+from flashdex.system.run_files import write_recipe
 
 DRAW = """
 import sys, numpy as np
@@ -155,7 +156,7 @@ def test_the_encoder_follows_no_link(rollout, tmp_path, monkeypatch):
 def test_films_of_a_run(run_dir, backend):
     recipe = yaml.safe_load((run_dir / "recipe.yaml").read_text())
     recipe["train"]["render_conversions"] = True
-    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    write_recipe(run_dir, yaml.safe_dump(recipe))
     text = write_report(run_dir).read_text()
     assert "data:video/mp4;base64," in text
     assert "data:image/png;base64," in text
@@ -174,7 +175,7 @@ def test_without_graphics_the_report_says_so_and_goes_on(run_dir, monkeypatch):
     find_backend.cache_clear()
     recipe = yaml.safe_load((run_dir / "recipe.yaml").read_text())
     recipe["train"]["render_conversions"] = True
-    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    write_recipe(run_dir, yaml.safe_dump(recipe))
     text = write_report(run_dir).read_text()
     find_backend.cache_clear()
     assert NO_GRAPHICS in text

@@ -1,6 +1,5 @@
 """report.html: numbers in their places, nothing unescaped, nothing from outside."""
 
-import json
 import re
 from html import unescape
 from html.parser import HTMLParser
@@ -11,6 +10,8 @@ import yaml
 from flashdex.errors import RunError
 from flashdex.reports.run.report import write_report
 from flashdex.reports.run.terminal import run_table
+from flashdex.system.jsonl import keep_lines, read_lines, write_lines
+from flashdex.system.run_files import write_recipe
 
 VOID = {"meta", "img"}
 
@@ -60,9 +61,9 @@ TRIVIAL = {
 @pytest.mark.parametrize("kind", TRIVIAL)
 def test_trivial_conversions_are_counted_apart_everywhere(run_dir, kind, table_rows):
     path = run_dir / "conversions.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines = read_lines(path)
     lines = [x | TRIVIAL[kind] if x["converted"] else x for x in lines]
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(path, lines)
     page = read_report(run_dir)
     found = headline(page)
     assert (found["converted"], found["and trivial"]) == ("0/5", "1")
@@ -112,7 +113,7 @@ def test_values_beyond_the_limit_are_marked(run_dir):
 def test_strings_are_escaped_and_the_page_is_well_formed(run_dir):
     recipe = yaml.safe_load((run_dir / "recipe.yaml").read_text())
     recipe["name"] = '"><img src=x onerror=alert(1)>'
-    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    write_recipe(run_dir, yaml.safe_dump(recipe))
     text = read_report(run_dir)
     assert "<script" not in text
     assert "<img src=x" not in text
@@ -180,9 +181,7 @@ def test_a_run_without_anything_yet(empty_run):
 
 
 def test_a_run_without_conversions(run_dir):
-    lines = (run_dir / "conversions.jsonl").read_text().splitlines()
-    kept = [line for line in lines if not json.loads(line)["converted"]]
-    (run_dir / "conversions.jsonl").write_text("\n".join(kept) + "\n")
+    keep_lines(run_dir / "conversions.jsonl", lambda line: not line["converted"])
     text = read_report(run_dir)
     # the files of the rollout are there, but no line claims it
     assert headline(text)["certified"] == "0/0"
@@ -201,11 +200,10 @@ def test_a_run_without_baselines(run_dir, table_rows):
 
 def test_a_conversion_without_certificate_says_so(run_dir, table_rows):
     (run_dir / "rollouts" / "push.certificate.json").unlink()
-    lines = [json.loads(x) for x in (run_dir / "conversions.jsonl").open()]
+    lines = read_lines(run_dir / "conversions.jsonl")
     for line in lines:
         line.pop("verdict", None)
-    text = "".join(json.dumps(line) + "\n" for line in lines)
-    (run_dir / "conversions.jsonl").write_text(text)
+    write_lines(run_dir / "conversions.jsonl", lines)
     page = read_report(run_dir)
     assert headline(page)["certified"] == "0/1"
     assert table_rows(page)[0]["certificate"] == "none"
@@ -218,7 +216,7 @@ def test_promises_of_the_recipe(run_dir):
         {"metric": "convert/cumulative", "at_env_steps": 9_000, "min": 1, "max": None},
         {"metric": "convert/cumulative", "at_env_steps": 90_000, "min": 2, "max": None},
     ]
-    (run_dir / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+    write_recipe(run_dir, yaml.safe_dump(recipe))
     text = read_report(run_dir)
     assert "convert/cumulative min 1 at 9,000 env steps. Found: 1.000." in text
     assert "min 2 at 90,000 env steps. Found: not reached yet." in text
@@ -230,18 +228,18 @@ def test_a_line_cut_by_a_crash_is_left_out_and_a_broken_one_is_named(run_dir):
     path.write_text(whole + '{"motion": "pu')
     assert headline(read_report(run_dir))["attempts"] == "7"
     path.write_text('{"motion": "pu\n' + whole)
-    with pytest.raises(RunError, match=r"conversions\.jsonl: line 1 is not JSON"):
+    with pytest.raises(RunError, match=r"conversions\.jsonl: line 1 has no seal"):
         write_report(run_dir)
-    path.write_text('{"motion": "push"}\n' + whole)
+    write_lines(path, [{"motion": "push"}])
     with pytest.raises(RunError, match="line 1 lacks 'converted'"):
         write_report(run_dir)
 
 
 def test_what_a_resumed_run_did_twice_is_drawn_once(run_dir):
     path = run_dir / "metrics.jsonl"
-    lines = [json.loads(line) for line in path.open()]
+    lines = read_lines(path)
     again = {**lines[1], "env_steps": 9_000.0, "hours": 0.05}
-    path.write_text("".join(json.dumps(x) + "\n" for x in [*lines, again]))
+    write_lines(path, [*lines, again])
     assert header(read_report(run_dir))["wall time"] == "3 min 00 s"
     chart = next(
         c

@@ -1,13 +1,12 @@
 """Tables for the terminal: the same facts as the page, within 100 columns."""
 
-import json
-
 from flashdex.reports.run.terminal import (
     evaluation_table,
     run_table,
     score_table,
 )
 from flashdex.reports.text import align, short, shorten
+from flashdex.system.jsonl import read_lines, write_lines
 
 
 def row_of(text, name):
@@ -52,11 +51,11 @@ def test_facts_of_a_run(run_dir, certificate):
 
 def test_no_line_is_longer_than_100(run_dir):
     path = run_dir / "conversions.jsonl"
-    lines = [json.loads(line) for line in path.open()]
+    lines = read_lines(path)
     for line in lines:
         line["motion"] = line["motion"] * 9
         line["why"] = [{"cause": "c" * 80, "hand": "left"}] if line["why"] else []
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(path, lines)
     assert max(map(len, run_table(run_dir).splitlines())) <= 100
 
 

@@ -15,6 +15,7 @@ import tamper
 from tamper import BOX, alone, change, put
 
 from flashdex.errors import RunError
+from flashdex.rollouts.rollout import MADE_BY, PROVENANCE
 
 
 def result_as_reference(data):
@@ -185,7 +186,46 @@ def test_physics_settings_that_are_none_are_told_of_a_file_alone(spoilt_run, kin
     assert alone(path)
 
 
+def without(part, name, *, more=lambda data: None):
+    def run(data):
+        said = json.loads(str(data[part]))
+        del said[name]
+        data[part] = np.asarray(json.dumps(said))
+        more(data)
+
+    return run
+
+
+def hidden_geom(data):
+    """What a file without its settings could not be compared with."""
+    geom = '<geom type="box" size=".1 .1 .005" pos="0 0 .03" rgba="0 0 0 0"/>'
+    tamper.replace_xml(data, '<body name="object0">', geom + '<body name="object0">')
+    tamper.simulate(data)
+
+
+DROPPED = {name: without("provenance", name) for name in PROVENANCE}
+DROPPED |= {name: without("versions", name) for name in MADE_BY}
+DROPPED["settings, geom"] = without("provenance", "physics", more=hidden_geom)
+DROPPED["a setting"] = lambda data: data.update(
+    provenance=np.asarray(str(data["provenance"]).replace('"impratio": 10.0, ', ""))
+)
+
+
+@pytest.mark.parametrize("kind", DROPPED)
+def test_a_file_that_says_less_is_found_alone_and_in_its_run(spoilt_run, check, kind):
+    path = spoilt_run / BOX
+    data = tamper.load(path)
+    before = str(data["provenance"]) + str(data["versions"])
+    DROPPED[kind](data)
+    assert str(data["provenance"]) + str(data["versions"]) != before
+    data["model_sha256"] = np.asarray(tamper.rollout_of(data).model_sha256)
+    tamper.store(path, data)
+    assert alone(path)
+    assert any(text.startswith(BOX) for text in check(spoilt_run))
+
+
 FIELDS = {
+    **{f"no {n}": lambda d, n=n: d.pop(n) for n in ("model_sha256", "wrist_bodies")},
     "address as a float": put("object_qpos_adr", lambda d: d["object_qpos_adr"] * 1.0),
     "address beyond": put("object_qpos_adr", lambda d: d["object_qpos_adr"] + 900),
     "address of a hand": put("object_qpos_adr", lambda d: d["object_qpos_adr"] * 0),

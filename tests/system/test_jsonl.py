@@ -88,17 +88,6 @@ def test_a_tail_that_a_crash_leaves_is_dropped_and_told(file, caplog, tail):
     assert read_lines(file)[-1] == {"n": 9}
 
 
-def test_lines_of_versions_before_the_seals_are_bound_by_the_first_sealed_one(tmp_path):
-    path = tmp_path / "a.jsonl"
-    path.write_text('{"n": 0}\n{"n": 1}\n')
-    append_line(path, {"n": 2})
-    append_line(path, {"n": 3})
-    assert [line["n"] for line in read_lines(path)] == [0, 1, 2, 3]
-    path.write_text(path.read_text().replace('"n": 1', '"n": 5'))
-    with pytest.raises(RunError, match="line 3 was changed, or one before it"):
-        read_lines(path)
-
-
 @pytest.mark.parametrize(
     ("line", "fault"),
     [

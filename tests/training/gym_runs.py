@@ -5,7 +5,7 @@ from __future__ import annotations
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.recipe import GymRecipe, LoopConfig
-from flashdex.system.jsonl import read_lines
+from flashdex.system.jsonl import read_lines, write_object
 from flashdex.training.gym import GymTask
 from flashdex.training.run_dir import make_trainer
 
@@ -44,6 +44,7 @@ def tiny_recipe(folder, env_id="Pendulum-v1", *, algo=None, train=None, **gym):
 def trainer_of(recipe, tmp_path):
     folder = tmp_path / "loose"
     folder.mkdir(parents=True)
+    write_object({"run": "0" * 32}, folder, "versions.json")
     return make_trainer(GymTask(recipe), folder)
 
 

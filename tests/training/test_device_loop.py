@@ -50,7 +50,7 @@ def make_trainer(make_bench, tmp_path):
             tmp_path,
             bench.make_learner(env),
             MetricLog(tmp_path, recipe),
-            start=SessionStart(env_steps=0, wall_s=0.0, lost=0),
+            start=SessionStart(env_steps=0, wall_s=0.0, lost=0, run="0" * 32),
         )
         trainer.guard = GradientGuard(waits=False)
         return trainer

@@ -20,7 +20,13 @@ from flashdex.replay.disk import ReplayLog
 from flashdex.rollouts.ledger import CONVERSIONS, Ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.files import run_lock
-from flashdex.system.jsonl import append_line, keep_lines, read_lines, read_object
+from flashdex.system.jsonl import (
+    append_line,
+    keep_lines,
+    read_lines,
+    read_object,
+    write_object,
+)
 from flashdex.system.run_files import MOTIONS, SESSIONS
 from flashdex.training import checkpoint
 from flashdex.training.checkpoint import load_checkpoint, save_checkpoint
@@ -133,6 +139,7 @@ def test_resumes_that_come_to_nothing_count_nothing_twice(tmp_path):
         line = {"env_steps": steps, "hours": seconds / 3600}
         append_line(tmp_path / "metrics.jsonl", line)
 
+    write_object({"run": "0" * 32}, tmp_path, "versions.json")
     record(100, 50.0)
     record(160, 80.0)
     first = begin()  # killed before it cuts the records off

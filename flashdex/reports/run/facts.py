@@ -84,6 +84,8 @@ def load_run(run_dir: str | Path) -> RunData:
     text = read_recipe(path)  # refuses what is none, or was changed
     check_run(path)
     check_sessions(path)
+    versions = read_object(path, VERSIONS)
+    versions.pop("run", None)  # its id, for machines
     try:
         composed = parse_yaml(text, where=str(path / RECIPE))
     except RecipeError as error:
@@ -91,7 +93,7 @@ def load_run(run_dir: str | Path) -> RunData:
     return RunData(
         path=path,
         recipe=composed,
-        versions=read_object(path, VERSIONS),
+        versions=versions,
         metrics=_drop_repeated(read_metrics(path)),
         attempts=read_lines(path / CONVERSIONS, ATTEMPT),
         baselines=_baselines(path),
@@ -136,7 +138,7 @@ def _drop_repeated(records: list[Line]) -> list[Line]:
 def _certificates(run_dir: Path) -> dict[str, Line]:
     found = {}
     for path in own_files(run_dir, ROLLOUTS, "*.certificate.json"):
-        certificate = read_object(run_dir, ROLLOUTS, path.name)
+        certificate = read_object(run_dir, ROLLOUTS, path.name, sealed=False)
         identity = certificate.get("identity")
         name = identity.get("motion") if isinstance(identity, dict) else None
         found[str(name or path.name.removesuffix(".certificate.json"))] = certificate

@@ -36,9 +36,18 @@ def compose(name: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
         >>> flashdex.compose("quickstart", ["env.num_envs=4"]).env.num_envs
         4
     """
+    _load_mujoco()
     from flashdex.recipe import compose
 
     return compose(name, list(overrides))
+
+
+def _load_mujoco() -> None:
+    """Its import starts a Python process, glfw's: not from the folder we are in."""
+    from flashdex.system.children import safe_path
+
+    with safe_path():
+        import mujoco  # noqa: F401
 
 
 def _tracking_recipe(recipe: RunRecipe | str | Path, *, where: str) -> Recipe:
@@ -71,6 +80,7 @@ def make_env(
     Raises:
         FlashdexError: the recipe has mistakes, or its motions cannot be had.
     """
+    _load_mujoco()
     from torchrl.envs import TransformedEnv
 
     from flashdex.training.build import RunBuilder
@@ -93,6 +103,7 @@ def load_library(source: RunRecipe | str | Path) -> MotionLibrary:
     Raises:
         LibraryError: it is missing, incomplete or of another schema.
     """
+    _load_mujoco()
     if isinstance(source, str | Path):
         from flashdex.motions.library import MotionLibrary
 
@@ -109,6 +120,7 @@ def load_run(run_dir: str | Path) -> Run:
     Raises:
         RunError: the folder holds no run.
     """
+    _load_mujoco()
     from flashdex.training.loaded import Run
 
     run = Run(Path(run_dir))

@@ -19,6 +19,7 @@ from flashdex.cli.data import Handler, add_data_verbs
 from flashdex.cli.interrupt import INTERRUPTED, loading
 from flashdex.cli.terminal import Formatter, path, say, set_up_streams
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
+from flashdex.system.run_files import ROLLOUTS, require_run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             from flashdex.envs.mdp.term import allow
 
             allow(*args.allow)
+        _check_words(args)
         return args.run(args)
     except FlashdexError as error:
         if args.debug:
@@ -73,14 +75,29 @@ def _set_up_logging(*, debug: bool) -> None:
 def _read_arguments(words: list[str]) -> argparse.Namespace:
     """Read the words after `flashdex`; what is wrong with them ends with 2."""
     parser = make_parser()
-    (verbs,) = (list(a.choices or ()) for a in parser._actions if a.dest == "verb")
+    (verbs,) = (dict(a.choices or {}) for a in parser._actions if a.dest == "verb")
     first = next((word for word in words if not word.startswith("-")), None)
+    known = f"Verbs: {', '.join(verbs)}"
     if first is not None and first not in verbs:
-        known = ", ".join(verbs)
-        parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} Verbs: {known}")
+        parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} {known}")
     args, rest = parser.parse_known_args(words)
-    _take_overrides(parser, args, rest)
+    if args.verb is None:
+        parser.error(f"{f'unknown: {rest[0]}' if rest else 'give a verb'}. {known}")
+    _take_overrides(verbs[args.verb], args, rest)
     return args
+
+
+def _check_words(args: argparse.Namespace) -> None:
+    """Refuse what the words alone show, before anything large is loaded."""
+    run = getattr(args, "resume", None)
+    if run is not None or args.verb in ("evaluate", "report"):
+        require_run(run or args.run_dir)
+    elif getattr(args, "recipe", None) and hasattr(args, "overrides"):
+        from flashdex.recipe.overrides import check_words, expand_sweeps
+
+        words = args.overrides
+        is_grid = getattr(args, "multirun", False)
+        check_words(args.recipe, expand_sweeps(words) if is_grid else [words])
 
 
 def _take_overrides(
@@ -101,17 +118,22 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of all verbs."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument(
-        "--debug", action="store_true", help="tracebacks and more detailed logs"
+        "--debug",
+        action="store_true",
+        default=argparse.SUPPRESS,  # or a verb would forget what stands before it
+        help="tracebacks and more detailed logs",
     )
     parser = argparse.ArgumentParser(
         prog="flashdex",
+        parents=[common],
         description="From recorded human hand-object motions to robot-hand "
         "trajectories that hold up in physics.",
     )
     parser.add_argument(
         "--version", action="version", version=f"flashdex {flashdex.__version__}"
     )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    parser.set_defaults(debug=False)
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB")
 
     def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:
         verb = verbs.add_parser(name, help=text, description=text, parents=[common])
@@ -199,12 +221,14 @@ def _add_run_verbs(
 def _doctor(args: argparse.Namespace) -> int:
     if args.recipe is not None:
         return _doctor_recipe(args)
+    is_whole = True
     with loading():
-        from flashdex.cli.doctor import examine, format_report
+        from flashdex.cli.doctor import examine
 
-        findings = examine()
-    say(format_report(findings))
-    return int(any(finding.status == "missing" for finding in findings))
+        for finding in examine():  # some take seconds
+            say(str(finding))
+            is_whole &= finding.status != "missing"
+    return int(not is_whole)
 
 
 def _doctor_recipe(args: argparse.Namespace) -> int:
@@ -234,6 +258,10 @@ def _cp(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
+    from flashdex.recipe.store import recipe_files
+
+    for given in args.paths:  # before anything large is loaded
+        recipe_files(given)
     with loading():
         from flashdex.recipe.merge import validate_paths
 
@@ -293,9 +321,6 @@ def _show_run(run_dir: Path) -> bool:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from flashdex.system.run_files import require_run
-
-    require_run(args.run_dir)  # before anything large is loaded
     with loading():
         from flashdex.reports.run.terminal import evaluation_table
         from flashdex.training.run_dir import evaluate
@@ -309,6 +334,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    if not (args.run_dir / ROLLOUTS).is_dir():  # they can be replayed without the rest
+        require_run(args.run_dir)
     with loading():
         from flashdex.recipe import require_motions
         from flashdex.reports.run.terminal import finding_lines, replay_line
@@ -327,8 +354,6 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from flashdex.system.run_files import require_run
-
     for folder in args.paths:  # before anything large is loaded
         require_run(folder, or_library=True)
     with loading():

@@ -39,7 +39,8 @@ class Formatter(logging.Formatter):
 
 
 def path(text: str) -> Path:
-    """A path that a file can have, for arguments of verbs."""
+    """A path that a file can have, for arguments of verbs; `~/` is the home folder."""
+    text = os.path.expanduser(text) if text.startswith("~/") else text
     parts = [os.fsencode(part) for part in text.split("/")]
     if not text or "\0" in text or max(map(len, parts)) > 255 or len(text) > 4000:
         raise ArgumentTypeError(f"'{text[:40]}' and what follows cannot be a path")

@@ -22,7 +22,8 @@ from flashdex.algorithms.base import config_class
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.term import KINDS, Kind, default_mapping, find_term, registry
 from flashdex.errors import FlashdexError, RecipeError, nearest
-from flashdex.recipe.schema import PATHS, RunRecipe
+from flashdex.recipe.overrides import PATHS
+from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.tasks import split_foreign
 
 R = TypeVar("R", bound=RunRecipe)

@@ -16,6 +16,7 @@ from flashdex.errors import (
     RecipeError,
     UnknownOptionError,
     UnknownRecipeError,
+    nearest,
 )
 from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
 
@@ -63,9 +64,13 @@ def find_recipe(name_or_path: str | Path) -> Path:
         path = Path(text)
         if is_file(path):
             return path.resolve()
+        named = text.removesuffix(path.suffix)
+        names = [f"{group}/{o}" for group, some in known_groups().items() for o in some]
+        names += [entry.name for entry in list_recipes()]
+        close = nearest(named, names) or nearest(path.stem, names)
         raise FlashdexError(
-            f"recipe {path}: there is no such file. Give the path of a YAML file or "
-            f"one of the names that `flashdex ls` lists."
+            f"recipe {path}: there is no such file.{close} Give the path of a YAML "
+            f"file or one of the names that `flashdex ls` lists."
         )
     for folder in search_dirs():
         if is_file(folder / f"{text}.yaml"):
@@ -91,6 +96,20 @@ def find_option(name: str | Path) -> Path | None:
     if group in known and option and not is_file(Path(name)):
         raise UnknownOptionError(option, known[group], where=group)
     return None
+
+
+def recipe_files(path: str | Path) -> list[Path]:
+    """Return the file of a recipe or an option, or the YAML files of a folder.
+
+    Raises:
+        FlashdexError: there is none.
+    """
+    if not Path(path).is_dir():
+        return [find_option(path) or find_recipe(path)]
+    files = sorted(Path(path).glob("*.yaml"))
+    if not files:
+        raise FlashdexError(f"{path}: no recipe (*.yaml) in this folder")
+    return files
 
 
 def group_of(path: Path) -> str | None:

@@ -11,11 +11,12 @@ import json
 import logging
 import os
 import sys
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import flashdex
-from flashdex.cli.data import Handler, add_data_verbs
+from flashdex.cli.data import Handler, add_allow, add_data_verbs, add_overrides
 from flashdex.cli.interrupt import INTERRUPTED, loading
 from flashdex.cli.terminal import Formatter, path, say, set_up_streams
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
@@ -106,12 +107,14 @@ def _take_overrides(
     """Add words that argparse could not place to the overrides, or refuse them."""
     flags = [word for word in rest if word.startswith("-")]
     if rest and (flags or not hasattr(args, "overrides")):
-        hint = ""
+        hint = "."
+        if flags:
+            hint += nearest(flags[0], parser._option_string_actions)
         if hasattr(args, "overrides"):
-            hint = "; values of the recipe are written key=value, without dashes"
+            hint += " Values of the recipe are written key=value, without dashes."
         parser.error(f"unknown: {' '.join(flags or rest)}{hint}")
     if rest:
-        args.overrides += rest
+        args.overrides = [*args.overrides, *rest]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -126,6 +129,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="flashdex",
         parents=[common],
+        allow_abbrev=False,
         description="From recorded human hand-object motions to robot-hand "
         "trajectories that hold up in physics.",
     )
@@ -136,7 +140,9 @@ def make_parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(dest="verb", metavar="VERB")
 
     def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:
-        verb = verbs.add_parser(name, help=text, description=text, parents=[common])
+        verb = verbs.add_parser(
+            name, help=text, description=text, parents=[common], allow_abbrev=False
+        )
         verb.set_defaults(run=run)
         return verb
 
@@ -144,23 +150,14 @@ def make_parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "recipe", nargs="?", help="say what memory this recipe needs instead"
     )
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
-    _add_allow(verb)
+    add_overrides(verb)
+    add_allow(verb)
     verb = add("ls", _ls, "list recipes and what they promise, options, sources, hands")
     verb.add_argument("--json", action="store_true", help="print JSON")
     _add_recipe_verbs(add)
     add_data_verbs(add)
     _add_run_verbs(add)
     return parser
-
-
-def _add_allow(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--allow",
-        action="append",
-        metavar="PACKAGE",
-        help="let the recipe name terms of this package of yours, which runs its code",
-    )
 
 
 def _add_recipe_verbs(
@@ -178,7 +175,7 @@ def _add_recipe_verbs(
         metavar="PATH",
         help="recipe, option of a group, or folder",
     )
-    _add_allow(verb)
+    add_allow(verb)
 
 
 def _add_run_verbs(
@@ -186,7 +183,7 @@ def _add_run_verbs(
 ) -> None:
     verb = add("train", _train, "train a recipe: train RECIPE key=value ...")
     verb.add_argument("recipe", nargs="?", help="name or path")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    add_overrides(verb)
     one = verb.add_mutually_exclusive_group()
     one.add_argument("--resume", type=path, metavar="RUN", help="continue a run")
     one.add_argument(
@@ -195,15 +192,16 @@ def _add_run_verbs(
     verb.add_argument(
         "--cfg", choices=["job"], help="print the composed recipe and stop"
     )
-    _add_allow(verb)
+    add_allow(verb)
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
-    _add_allow(verb)
+    _add_run(verb)
+    add_overrides(verb)
+    add_allow(verb)
 
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
+    _add_run(verb)
+    add_allow(verb)
 
     verb = add("score", _score, "score stored rollouts by every criterion")
     verb.add_argument(
@@ -212,10 +210,23 @@ def _add_run_verbs(
     verb.add_argument("--json", action="store_true", help="print JSON")
 
     verb = add("verify", _verify, "check every hash of runs and motion libraries")
-    verb.add_argument("paths", type=path, nargs="+", metavar="RUN|LIBRARY")
+    verb.add_argument(
+        "paths",
+        type=path,
+        nargs="+",
+        metavar="RUN|LIBRARY",
+        help="folder that `train` or `prepare` wrote",
+    )
+    add_allow(verb)
 
     verb = add("report", _report, "write report.html of a run again")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
+    _add_run(verb)
+
+
+def _add_run(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "run_dir", type=path, metavar="RUN", help="folder that `train` wrote"
+    )
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -368,12 +379,13 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _score(args: argparse.Namespace) -> int:
-    absent = [str(file) for file in args.files if not file.is_file()]
-    if absent:
-        raise FlashdexError(
-            f"{', '.join(absent)}: no such file. Name stored rollouts, "
-            "RUN/rollouts/*.npz; of a whole run 'flashdex replay RUN' tells more"
-        )
+    for file in args.files:
+        if not file.is_file() or not zipfile.is_zipfile(file):
+            fault = "is no .npz file" if file.is_file() else "there is no such file"
+            raise FlashdexError(
+                f"{file}: {fault}. Name stored rollouts, RUN/rollouts/*.npz; of a "
+                "whole run 'flashdex replay RUN' tells more."
+            )
     with loading():
         from flashdex.reports.run.terminal import finding_lines, score_table
         from flashdex.rollouts.rollout import Rollout

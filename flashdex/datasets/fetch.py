@@ -62,6 +62,8 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
     """
     if name != "myodm":
         raise UnknownDatasetError(name, ["myodm"])
+    if wheel is not None and not wheel.is_file():
+        raise DemoError(f"--wheel: there is no file {wheel}.")
     out = out or myodm_dir()
     if _is_complete(out):
         return out

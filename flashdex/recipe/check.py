@@ -104,6 +104,14 @@ def validate(recipe: R) -> R:
     return typing.cast(R, complete)
 
 
+def check_option(cls: type, key: str, value: Any, *, where: str) -> None:
+    """Refuse one value of a dataclass whose other values have defaults."""
+    problems: list[str] = []
+    _build(cls, {key: value}, "", problems)
+    if problems:
+        raise RecipeError(problems, where=where)
+
+
 def _read_env(data: Any, problems: list[str]) -> EnvConfig:
     """Read the environment, whose terms are registered by name."""
     if not isinstance(data, Mapping):

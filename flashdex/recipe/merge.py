@@ -221,8 +221,13 @@ def inspect_recipe(
     name_or_path: str | Path,
     overrides: Sequence[str] = (),
 ) -> tuple[RunRecipe, list[str]]:
-    """Compose without raising: the recipe (unusable with problems) and the problems."""
+    """The recipe (unusable with problems) and the problems.
+
+    Raises:
+        FlashdexError: there is no such file, or it cannot be read.
+    """
     path = find_recipe(name_or_path)
+    parse_yaml(read_text(path), where=path.name)  # what else could be said is not true
     changes, problems = parse_overrides(overrides)
     composer = _Composer(path.parent, problems)
     changes = composer.choose(changes)
@@ -319,6 +324,6 @@ def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
 def _problems_of(file: Path) -> list[str]:
     try:
         group = group_of(file)
+        return inspect_option(file, group) if group else inspect_recipe(file)[1]
     except RecipeError as error:
         return error.problems
-    return inspect_option(file, group) if group else inspect_recipe(file)[1]

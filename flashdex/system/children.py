@@ -30,9 +30,7 @@ def safe_path() -> Iterator[None]:
             os.environ[_SAFE] = before
 
 
-def spawning_pool(
-    workers: int, initializer: Callable[[], None]
-) -> ProcessPoolExecutor:
+def spawning_pool(workers: int, initializer: Callable[[], None]) -> ProcessPoolExecutor:
     """A pool of fresh processes: a fork would share torch's threads and the GPU.
 
     Args:

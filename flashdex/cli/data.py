@@ -99,6 +99,7 @@ def add_overrides(verb: argparse.ArgumentParser) -> None:
 
 
 def add_allow(verb: argparse.ArgumentParser) -> None:
+    """Add the packages whose code a recipe may run to a verb that reads one."""
     verb.add_argument(
         "--allow",
         action="append",

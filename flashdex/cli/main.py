@@ -82,6 +82,7 @@ def _read_arguments(words: list[str]) -> argparse.Namespace:
     if first is not None and first not in verbs:
         parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} {known}")
     args, rest = parser.parse_known_args(words)
+    args.debug = "debug" in args
     if args.verb is None:
         parser.error(f"{f'unknown: {rest[0]}' if rest else 'give a verb'}. {known}")
     _take_overrides(verbs[args.verb], args, rest)
@@ -136,7 +137,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--version", action="version", version=f"flashdex {flashdex.__version__}"
     )
-    parser.set_defaults(debug=False)
     verbs = parser.add_subparsers(dest="verb", metavar="VERB")
 
     def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:

@@ -46,16 +46,25 @@ def test_a_user_error_is_two_and_goes_to_stderr(run):
     assert "Did you mean 'quickstart'?" in err
 
 
-def test_debug_shows_the_traceback():
+@pytest.mark.parametrize("words", [["train", "--debug"], ["--debug", "train"]])
+def test_debug_shows_the_traceback(words):
     with pytest.raises(flashdex.errors.FlashdexError):
-        main(["train", "quickstrat", "--debug"])
+        main([*words, "quickstrat"])
 
 
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        ([], "required"),
+        ([], "give a verb. Verbs: doctor, ls, "),
+        (["--verison"], "unknown: --verison. Verbs: doctor, ls, "),
         (["trian"], "Did you mean 'train'?"),
+        (["TRAIN"], "Did you mean 'train'?"),
+        (["ls", "--jsno"], "unknown: --jsno. Did you mean '--json'?"),
+        (["validate", "quickstart", "--all"], "unknown: --all"),
+        (["evaluate"], "required: RUN\n"),
+        (["cp", "quickstart.yml", "x"], "Did you mean 'quickstart'?"),
+        (["cp", "ablations/no_futur", "x"], "Did you mean 'ablation/no_future'?"),
+        (["fetch", "myodm", "--wheel", "/nowhere"], "there is no file /nowhere"),
         (["train"], "give a recipe"),
         (["train", "quickstart", "--lr", "3"], "key=value, without dashes"),
         (["ls", "something"], "unknown: something"),

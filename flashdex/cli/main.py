@@ -18,7 +18,7 @@ from pathlib import Path
 import flashdex
 from flashdex.cli.data import Handler, add_allow, add_data_verbs, add_overrides
 from flashdex.cli.interrupt import INTERRUPTED, loading
-from flashdex.cli.terminal import Formatter, path, say, set_up_streams
+from flashdex.cli.terminal import Formatter, path, path_text, say, set_up_streams
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
 from flashdex.system.run_files import ROLLOUTS, require_run
 
@@ -165,7 +165,7 @@ def _add_recipe_verbs(
 ) -> None:
     verb = add("cp", _cp, "copy a recipe, or an option of one, to edit it")
     verb.add_argument("recipe", help="name or path, or GROUP/OPTION: ablation/ppo")
-    verb.add_argument("dest", type=path, help="new file or folder")
+    verb.add_argument("dest", type=path_text, help="new file, or a folder")
 
     verb = add("validate", _validate, "find every mistake in recipes and options")
     verb.add_argument(

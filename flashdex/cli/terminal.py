@@ -40,11 +40,16 @@ class Formatter(logging.Formatter):
 
 def path(text: str) -> Path:
     """A path that a file can have, for arguments of verbs; `~/` is the home folder."""
+    return Path(path_text(text))
+
+
+def path_text(text: str) -> str:
+    """The same with the slash at its end, where that says something."""
     text = os.path.expanduser(text) if text.startswith("~/") else text
     parts = [os.fsencode(part) for part in text.split("/")]
     if not text or "\0" in text or max(map(len, parts)) > 255 or len(text) > 4000:
         raise ArgumentTypeError(f"'{text[:40]}' and what follows cannot be a path")
-    return Path(text)
+    return text
 
 
 def number_above(low: float, *, whole: bool = False) -> Callable[[str], float]:

@@ -207,14 +207,14 @@ def copy_recipe(name_or_path: str | Path, destination: str | Path) -> Path:
 
     Args:
         name_or_path: the recipe, or `group/option`.
-        destination: a new file, or an existing folder.
+        destination: a new file, or a folder: one that exists or ends with a slash.
 
     Returns:
         The new file.
     """
     source = find_option(name_or_path) or find_recipe(name_or_path)
     text, target = read_text(source), Path(destination)
-    if target.is_dir():
+    if target.is_dir() or str(destination).endswith("/"):
         target = target / source.name
     if target.suffix not in (".yaml", ".yml"):
         target = target.with_name(f"{target.name}.yaml")

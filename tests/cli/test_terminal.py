@@ -268,6 +268,13 @@ def test_cp_never_writes_over_anything(target, make, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_cp_into_a_folder_that_a_slash_says_to_make(tmp_path):
+    assert exit_code("cp", "quickstart", f"{tmp_path}/new/") == 0
+    assert exit_code("cp", "real_cpu", f"{tmp_path}/new/") == 0
+    names = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert names == ["quickstart.yaml", "real_cpu.yaml"]
+
+
 @pytest.mark.parametrize("word", ["seed=nan", "motions.library=/nowhere"])
 def test_a_refused_baselines_leaves_the_file_it_would_replace(word, tmp_path, capsys):
     out = tmp_path / "scores.json"

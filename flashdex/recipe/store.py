@@ -5,6 +5,7 @@ Nothing here imports the schema, which would import torch.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,8 +49,9 @@ def package_dir() -> Path:
 
 def search_dirs() -> list[Path]:
     """Return the folders a name is looked up in, first match wins."""
-    local = Path.cwd() / "recipes"
-    dirs = [local.resolve(), package_dir().resolve()]
+    dirs = [package_dir().resolve()]
+    with contextlib.suppress(FileNotFoundError):  # the folder we are in was removed
+        dirs.insert(0, Path("recipes").resolve())
     return [d for i, d in enumerate(dirs) if d.is_dir() and d not in dirs[:i]]
 
 
@@ -64,18 +66,26 @@ def find_recipe(name_or_path: str | Path) -> Path:
         path = Path(text)
         if is_file(path):
             return path.resolve()
-        named = text.removesuffix(path.suffix)
-        names = [f"{group}/{o}" for group, some in known_groups().items() for o in some]
-        names += [entry.name for entry in list_recipes()]
-        close = nearest(named, names) or nearest(path.stem, names)
         raise FlashdexError(
-            f"recipe {path}: there is no such file.{close} Give the path of a YAML "
-            f"file or one of the names that `flashdex ls` lists."
+            f"recipe {path}: there is no such file.{_what_was_meant(path)} Give the "
+            f"path of a YAML file or one of the names that `flashdex ls` lists."
         )
     for folder in search_dirs():
         if is_file(folder / f"{text}.yaml"):
             return folder / f"{text}.yaml"
     raise UnknownRecipeError(text, [entry.name for entry in list_recipes()])
+
+
+def _what_was_meant(path: Path) -> str:
+    """A hint for who gave a path at which no recipe lies."""
+    if is_file(path / "recipe.yaml"):
+        return f" It is the folder of a run, whose recipe is {path / 'recipe.yaml'}."
+    named = str(path.with_suffix(""))
+    names = [f"{group}/{o}" for group, some in known_groups().items() for o in some]
+    if named in names:
+        return f" It is an option: add {named.replace('/', '=')} to a recipe."
+    names += [entry.name for entry in list_recipes()]
+    return nearest(named, names) or nearest(path.stem, names)
 
 
 def is_file(path: Path) -> bool:

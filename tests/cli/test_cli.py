@@ -63,6 +63,7 @@ def test_debug_shows_the_traceback(words):
         (["validate", "quickstart", "--all"], "unknown: --all"),
         (["evaluate"], "required: RUN\n"),
         (["cp", "quickstart.yml", "x"], "Did you mean 'quickstart'?"),
+        (["train", "ablation/ppo"], "It is an option: add ablation=ppo to a recipe"),
         (["cp", "ablations/no_futur", "x"], "Did you mean 'ablation/no_future'?"),
         (["fetch", "myodm", "--wheel", "/nowhere"], "there is no file /nowhere"),
         (["train"], "give a recipe"),
@@ -150,6 +151,25 @@ def test_cp_then_validate(run, tmp_path):
     code, _, err = run("validate", str(tmp_path), "bench50_xhand")
     assert code == 2
     assert "env.num_env: unknown key" in err
+
+
+def test_the_folder_of_a_run_is_no_recipe(run, tmp_path):
+    (tmp_path / "recipe.yaml").write_text("seed: 1")
+    code, _, err = run("train", f"{tmp_path}/")
+    assert code == 2
+    assert f"whose recipe is {tmp_path}/recipe.yaml." in err
+
+
+def test_a_folder_that_was_removed_under_us_hides_no_recipes(
+    run, tmp_path, monkeypatch
+):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "here").rmdir()
+    code, out, _ = run("ls")
+    assert (code, "quickstart" in out) == (0, True)
+    code, _, err = run("cp", "quickstart", "x.yaml")
+    assert (code, "cannot be written" in err) == (2, True)
 
 
 def test_cp_below_a_file_says_so(run, tmp_path):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import sys
 import zipfile
@@ -18,7 +17,14 @@ from pathlib import Path
 import flashdex
 from flashdex.cli.data import Handler, add_allow, add_data_verbs, add_overrides
 from flashdex.cli.interrupt import INTERRUPTED, loading
-from flashdex.cli.terminal import Formatter, path, path_text, say, set_up_streams
+from flashdex.cli.terminal import (
+    check_words,
+    path,
+    path_text,
+    say,
+    set_up_logging,
+    set_up_streams,
+)
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
 from flashdex.system.run_files import ROLLOUTS, require_run
 
@@ -38,13 +44,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     with loading():
         set_up_streams()
         args = _read_arguments(sys.argv[1:] if argv is None else list(argv))
-        _set_up_logging(debug=args.debug)
+        set_up_logging(debug=args.debug)
     try:
         if getattr(args, "allow", None):
             from flashdex.envs.mdp.term import allow
 
             allow(*args.allow)
-        _check_words(args)
+        check_words(args)
         return args.run(args)
     except FlashdexError as error:
         if args.debug:
@@ -64,15 +70,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _set_up_logging(*, debug: bool) -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
-    # of other packages only what is wrong: OpenGL reports what it has not found
-    level = logging.DEBUG if debug else logging.WARNING
-    logging.basicConfig(level=level, handlers=[handler])
-    logging.getLogger("flashdex").setLevel(min(level, logging.INFO))
-
-
 def _read_arguments(words: list[str]) -> argparse.Namespace:
     """Read the words after `flashdex`; what is wrong with them ends with 2."""
     parser = make_parser()
@@ -87,19 +84,6 @@ def _read_arguments(words: list[str]) -> argparse.Namespace:
         parser.error(f"{f'unknown: {rest[0]}' if rest else 'give a verb'}. {known}")
     _take_overrides(verbs[args.verb], args, rest)
     return args
-
-
-def _check_words(args: argparse.Namespace) -> None:
-    """Refuse what the words alone show, before anything large is loaded."""
-    run = getattr(args, "resume", None)
-    if run is not None or args.verb in ("evaluate", "report"):
-        require_run(run or args.run_dir)
-    elif getattr(args, "recipe", None) and hasattr(args, "overrides"):
-        from flashdex.recipe.overrides import check_words, expand_sweeps
-
-        words = args.overrides
-        is_grid = getattr(args, "multirun", False)
-        check_words(args.recipe, expand_sweeps(words) if is_grid else [words])
 
 
 def _take_overrides(

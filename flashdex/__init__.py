@@ -7,8 +7,10 @@ imported when a function is called.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from types import UnionType
+from typing import TYPE_CHECKING, get_args
 
 if TYPE_CHECKING:
     from torchrl.envs import TransformedEnv
@@ -36,16 +38,42 @@ def compose(name: str | Path, overrides: Sequence[str] = ()) -> RunRecipe:
         >>> flashdex.compose("quickstart", ["env.num_envs=4"]).env.num_envs
         4
     """
+    _load_mujoco()
+    _expect(name, str | Path, "compose: name")
+    _expect(overrides, list | tuple, "compose: overrides")
+    for i, word in enumerate(overrides):
+        _expect(word, str, f"compose: overrides[{i}]")
     from flashdex.recipe import compose
 
     return compose(name, list(overrides))
 
 
-def _tracking_recipe(recipe: RunRecipe | str | Path, *, where: str) -> Recipe:
-    from flashdex.recipe import Recipe, expect_kind
+def _expect(value: object, kind: type | UnionType, where: str) -> None:
+    if not isinstance(value, kind):
+        from flashdex.errors import FlashdexError
 
-    found = compose(recipe) if isinstance(recipe, str | Path) else recipe
-    return expect_kind(found, Recipe, where=where)
+        kinds = get_args(kind) or (kind,)
+        wanted = " or ".join(getattr(k, "__name__", str(k)) for k in kinds)
+        found = f"{value!r:.60} of type {type(value).__name__}"
+        raise FlashdexError(f"{where}: expected {wanted}, found {found}")
+
+
+def _load_mujoco() -> None:
+    """Its import starts a Python process, glfw's: not from the folder we are in."""
+    from flashdex.system.children import safe_path
+
+    with safe_path():
+        import mujoco  # noqa: F401
+
+
+def _tracking_recipe(recipe: RunRecipe | str | Path, *, where: str) -> Recipe:
+    from flashdex.recipe import Recipe, RunRecipe, expect_kind, validate
+
+    _expect(recipe, RunRecipe | str | Path, where)
+    if isinstance(recipe, str | Path):
+        recipe = compose(recipe)
+    # one that was changed in Python was not checked since
+    return validate(expect_kind(recipe, Recipe, where=where))
 
 
 def make_env(
@@ -71,12 +99,21 @@ def make_env(
     Raises:
         FlashdexError: the recipe has mistakes, or its motions cannot be had.
     """
+    _load_mujoco()
     from torchrl.envs import TransformedEnv
 
+    from flashdex.envs.config import EnvConfig
+    from flashdex.recipe.check import check_option, validate
     from flashdex.training.build import RunBuilder
 
-    builder = RunBuilder.from_recipe(_tracking_recipe(recipe, where="make_env"))
-    plain = builder.make_env(num_envs=num_envs, seed=seed, evaluation=evaluation)
+    found = _tracking_recipe(recipe, where="make_env")
+    if seed is not None:
+        found = validate(replace(found, seed=seed))
+    if num_envs is not None:
+        check_option(EnvConfig, "num_envs", num_envs, where="make_env")
+    _expect(evaluation, bool, "make_env: evaluation")
+    builder = RunBuilder.from_recipe(found)
+    plain = builder.make_env(num_envs=num_envs, evaluation=evaluation)
     env = TransformedEnv(plain)
     for transform in builder.make_transforms(builder.bank):
         env.append_transform(transform)
@@ -93,6 +130,7 @@ def load_library(source: RunRecipe | str | Path) -> MotionLibrary:
     Raises:
         LibraryError: it is missing, incomplete or of another schema.
     """
+    _load_mujoco()
     if isinstance(source, str | Path):
         from flashdex.motions.library import MotionLibrary
 
@@ -109,6 +147,8 @@ def load_run(run_dir: str | Path) -> Run:
     Raises:
         RunError: the folder holds no run.
     """
+    _load_mujoco()
+    _expect(run_dir, str | Path, "load_run")
     from flashdex.training.loaded import Run
 
     run = Run(Path(run_dir))
@@ -128,5 +168,7 @@ def load_policy(run: Run | str | Path) -> RunPolicy:
     Raises:
         RunError: there is no run, or no checkpoint that can be read.
     """
-    opened = load_run(run) if isinstance(run, str | Path) else run
-    return cast("Run", opened).policy()
+    from flashdex.training.loaded import Run
+
+    opened = run if isinstance(run, Run) else load_run(run)
+    return opened.policy()

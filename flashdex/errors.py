@@ -45,8 +45,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
         name: the word the user wrote.
         known: the words that would have been accepted.
     """
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" Did you mean '{close[0]}'?" if close else ""
+    plain = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(name.lower(), plain, n=1)
+    return f" Did you mean '{plain[close[0]]}'?" if close else ""
 
 
 # an OSError that the data cause: nothing there, or a name that no file can have

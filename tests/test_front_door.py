@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
@@ -100,3 +101,46 @@ def test_mistakes_are_told(tmp_path):
         flashdex.make_env("gym_halfcheetah_small")
     with pytest.raises(FlashdexError):
         flashdex.load_library(tmp_path)
+    (tmp_path / "torn.yaml").write_text("seed: [")
+    with pytest.raises(RecipeError) as found:
+        flashdex.compose(tmp_path / "torn.yaml")
+    assert len(found.value.problems) == 1  # nothing is said to be missing
+
+
+@pytest.mark.parametrize(
+    ("call", "words", "expected"),
+    [
+        ("compose", [None], "name: expected str or Path, found None"),
+        ("compose", ["quickstart", "seed=3"], "overrides: expected list or tuple"),
+        ("compose", ["quickstart", [3]], r"overrides\[0\]: expected str, found 3"),
+        ("make_env", [{"name": "quickstart"}], "expected RunRecipe or str or Path"),
+        ("load_library", [None], "expected RunRecipe or str or Path"),
+        ("load_run", [b"runs/a"], "expected str or Path, found b'runs/a'"),
+        ("load_policy", [{}], "expected str or Path"),
+    ],
+)
+def test_what_is_of_another_type_is_told(call, words, expected):
+    with pytest.raises(FlashdexError, match=expected):
+        getattr(flashdex, call)(*words)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ({"num_envs": 0}, "num_envs: 0 must be at least 1"),
+        ({"num_envs": "4"}, "num_envs: expected an integer"),
+        ({"num_envs": 10**9}, "num_envs: 1000000000 must be at most"),
+        ({"seed": -1}, "seed: -1 must be at least 0"),
+        ({"seed": 1.5}, "seed: expected an integer"),
+        ({"evaluation": "no"}, "evaluation: expected bool"),
+    ],
+)
+def test_numbers_of_an_env_are_held_to_the_schema(recipe, words, expected):
+    with pytest.raises(FlashdexError, match=expected):
+        flashdex.make_env(recipe, **words)
+
+
+def test_a_recipe_changed_in_python_is_checked(recipe):
+    changed = dataclasses.replace(recipe.env, num_envs="4")
+    with pytest.raises(RecipeError, match=r"env\.num_envs: expected an integer"):
+        flashdex.make_env(dataclasses.replace(recipe, env=changed))

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 from flashdex.cli.interrupt import loading
 from flashdex.cli.terminal import number_above, path, say
-from flashdex.datasets import source_names
-from flashdex.errors import FlashdexError, UnknownHandError, UnknownSourceError
+from flashdex.datasets import check_options
+from flashdex.datasets.source import SourceOptions
+from flashdex.errors import FlashdexError, UnknownHandError
 from flashdex.hands import known_hands
 
 if TYPE_CHECKING:  # the command line starts fast: heavy parts load in their verb
     from flashdex.motions.pipeline.prepare import Order
 
-MADE_UP = "procedural"  # its --input is a word
 Handler = Callable[[argparse.Namespace], int]
 
 
@@ -53,7 +53,7 @@ def add_data_verbs(
         "--speed",
         type=rate,
         default=1.0,
-        help="of playback; 0.5 makes motions last twice as long",
+        help="of playback (%(default)g); 0.5 makes motions last twice as long",
     )
     verb.add_argument(
         "--cut",
@@ -82,13 +82,30 @@ def add_data_verbs(
 
     verb = add("baselines", _baselines, "score what no learning achieves")
     verb.add_argument("recipe", help="name or path: its motions and physics")
+    add_overrides(verb)
+    verb.add_argument("--out", type=path, help="JSON file for every score")
+    add_allow(verb)
+
+
+def add_overrides(verb: argparse.ArgumentParser) -> None:
+    """Add the changes of a recipe, as many as there are, to a verb."""
     verb.add_argument(
         "overrides",
         nargs="*",
+        default=[],  # or argparse calls them required
         metavar="key=value",
-        help="changes, e.g. motions.library=libraries/mine",
+        help="changes, e.g. motions.library=libraries/mine; docs/recipes.md",
     )
-    verb.add_argument("--out", type=path, help="JSON file for every score")
+
+
+def add_allow(verb: argparse.ArgumentParser) -> None:
+    """Add the packages whose code a recipe may run to a verb that reads one."""
+    verb.add_argument(
+        "--allow",
+        action="append",
+        metavar="PACKAGE",
+        help="let the recipe name terms of this package of yours, which runs its code",
+    )
 
 
 def _fetch(args: argparse.Namespace) -> int:
@@ -123,24 +140,21 @@ def _prepare(args: argparse.Namespace) -> int:
 
 def _check_words(args: argparse.Namespace) -> None:
     """Refuse what can be refused before anything is loaded."""
-    if args.source not in source_names():
-        raise UnknownSourceError(args.source, source_names())
+    check_options(args.source, _options(args))
     if args.hand not in known_hands():
         raise UnknownHandError(args.hand, known_hands())
-    for name in ("input", "mano", "models", "splits"):
+    for name in ("mano", "models", "splits"):
         path = getattr(args, name)
-        if path is not None and not (os.path.lexists(path) or args.source == MADE_UP):
+        if path is not None and not os.path.lexists(path):
             raise FlashdexError(f"--{name}: no such file or folder: {path}")
     if args.out is None and not args.dry_run:
         raise FlashdexError("give --out: the folder of the library")
+    if args.out is not None and os.path.lexists(args.out) and not args.out.is_dir():
+        raise FlashdexError(f"--out: {args.out} is no folder; give a new one")
 
 
-def _order(args: argparse.Namespace) -> Order:
-    from flashdex.datasets.source import SourceOptions
-    from flashdex.motions.pipeline.motion import MotionSettings
-    from flashdex.motions.pipeline.prepare import Order
-
-    options = SourceOptions(
+def _options(args: argparse.Namespace) -> SourceOptions:
+    return SourceOptions(
         path=args.input,
         mano=args.mano,
         models=args.models,
@@ -148,6 +162,12 @@ def _order(args: argparse.Namespace) -> Order:
         seed=args.seed,
         limit=args.limit,
     )
+
+
+def _order(args: argparse.Namespace) -> Order:
+    from flashdex.motions.pipeline.motion import MotionSettings
+    from flashdex.motions.pipeline.prepare import Order
+
     settings = MotionSettings(
         hand=args.hand,
         control_hz=args.hz,
@@ -155,7 +175,7 @@ def _order(args: argparse.Namespace) -> Order:
         speed=args.speed,
         strict=args.strict,
     )
-    return Order(args.source, options, settings)
+    return Order(args.source, _options(args), settings)
 
 
 def _list_recordings(order: Order) -> int:

@@ -6,8 +6,8 @@ import os
 import platform
 import re
 import shutil
-import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -17,18 +17,6 @@ import flashdex
 
 Status = Literal["ok", "note", "missing"]
 
-# Renders one small picture; a back end that only imports is no back end.
-_RENDER = """
-import mujoco
-model = mujoco.MjModel.from_xml_string(
-    "<mujoco><worldbody><light pos='0 0 3'/>"
-    "<geom type='box' size='.1 .1 .1' rgba='1 0 0 1'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 32, 32) as renderer:
-    renderer.update_scene(data)
-    assert renderer.render().max() > 0
-"""
 _GL_PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}
 
 
@@ -43,26 +31,21 @@ class Finding:
     detail: str
     """What was found, and what to do about it."""
 
+    def __str__(self) -> str:
+        """A line of the report."""
+        sign = self.status.upper() if self.status == "missing" else self.status
+        return f"{sign:<7}  {self.what:<14}  {self.detail}"
 
-def examine() -> list[Finding]:
+
+def examine() -> Iterator[Finding]:
     """Look at everything; a missing package is a finding, never an exception."""
-    return [
-        _python(),
-        *_packages(),
-        _cpu(),
-        _gpu(),
-        _graphics(),
-        _disk(Path.cwd()),
-        *_extras(),
-    ]
-
-
-def format_report(findings: list[Finding]) -> str:
-    """Lay the findings out as a table."""
-    width = max(len(f.what) for f in findings)
-    signs = {"ok": "ok     ", "note": "note   ", "missing": "MISSING"}
-    lines = [f"{signs[f.status]}  {f.what:<{width}}  {f.detail}" for f in findings]
-    return "\n".join(lines)
+    yield _python()
+    yield from _packages()
+    yield _cpu()
+    yield _gpu()
+    yield _graphics()
+    yield _disk(Path.cwd())
+    yield from _extras()
 
 
 def examine_recipe(name: str, overrides: list[str]) -> tuple[str, bool]:
@@ -169,22 +152,13 @@ def _gpu() -> Finding:
 
 def _graphics() -> Finding:
     """Render one picture with each off-screen back end until one works."""
-    asked = os.environ.get("MUJOCO_GL")
-    tried = [asked] if asked else ["egl", "osmesa"]
-    for backend in tried:
-        try:
-            result = subprocess.run(
-                [sys.executable, "-P", "-c", _RENDER],
-                env={**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend},
-                capture_output=True,
-                timeout=60,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            continue
-        if result.returncode == 0:
-            hint = "" if asked else f" (export MUJOCO_GL={backend})"
-            return Finding("ok", "graphics", f"{backend} renders{hint}")
+    from flashdex.reports.render.films import find_backend, usual_backends
+
+    asked, backend = os.environ.get("MUJOCO_GL"), find_backend()
+    if backend is not None:
+        hint = "" if asked else f" (export MUJOCO_GL={backend})"
+        return Finding("ok", "graphics", f"{backend} renders{hint}")
+    tried = usual_backends()
     packages = " or ".join(_GL_PACKAGES.get(b, b) for b in tried)
     return Finding(
         "note",

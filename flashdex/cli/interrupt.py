@@ -1,19 +1,40 @@
-"""Ctrl-C while libraries load; imported first, so it imports little."""
+"""What is heard and said while libraries load; imported first, so imports little."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTED = 130  # exit code, as shells have it
+PATIENCE_S = 3.0  # after which somebody at a terminal is told what takes so long
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """While libraries load, Ctrl-C ends the process at once.
+    """While libraries load, a terminal is told so, and Ctrl-C ends the process."""
+    timer = threading.Timer(PATIENCE_S, _tell)
+    timer.daemon = True
+    if sys.stderr is not None and sys.stderr.isatty():
+        timer.start()
+    try:
+        with _leaving():
+            yield
+    finally:
+        timer.cancel()
+
+
+def _tell() -> None:
+    sys.stderr.write("loading libraries ...\n")
+
+
+@contextmanager
+def _leaving() -> Iterator[None]:
+    """Ctrl-C ends the process at once.
 
     An import may swallow KeyboardInterrupt, and the verb would go on for hours; nothing
     is there yet that an orderly end would save. A process that ignores Ctrl-C still

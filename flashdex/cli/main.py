@@ -8,17 +8,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import sys
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import flashdex
-from flashdex.cli.data import Handler, add_data_verbs
+from flashdex.cli.data import Handler, add_allow, add_data_verbs, add_overrides
 from flashdex.cli.interrupt import INTERRUPTED, loading
-from flashdex.cli.terminal import Formatter, path, say, set_up_streams
+from flashdex.cli.terminal import (
+    check_words,
+    path,
+    path_text,
+    say,
+    set_up_logging,
+    set_up_streams,
+)
 from flashdex.errors import FlashdexError, MissingExtraError, nearest
+from flashdex.system.run_files import ROLLOUTS, require_run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,12 +44,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     with loading():
         set_up_streams()
         args = _read_arguments(sys.argv[1:] if argv is None else list(argv))
-        _set_up_logging(debug=args.debug)
+        set_up_logging(debug=args.debug)
     try:
         if getattr(args, "allow", None):
             from flashdex.envs.mdp.term import allow
 
             allow(*args.allow)
+        check_words(args)
         return args.run(args)
     except FlashdexError as error:
         if args.debug:
@@ -61,25 +70,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _set_up_logging(*, debug: bool) -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
-    # of other packages only what is wrong: OpenGL reports what it has not found
-    level = logging.DEBUG if debug else logging.WARNING
-    logging.basicConfig(level=level, handlers=[handler])
-    logging.getLogger("flashdex").setLevel(min(level, logging.INFO))
-
-
 def _read_arguments(words: list[str]) -> argparse.Namespace:
     """Read the words after `flashdex`; what is wrong with them ends with 2."""
     parser = make_parser()
-    (verbs,) = (list(a.choices or ()) for a in parser._actions if a.dest == "verb")
+    (verbs,) = (dict(a.choices or {}) for a in parser._actions if a.dest == "verb")
     first = next((word for word in words if not word.startswith("-")), None)
+    known = f"Verbs: {', '.join(verbs)}"
     if first is not None and first not in verbs:
-        known = ", ".join(verbs)
-        parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} Verbs: {known}")
+        parser.error(f"unknown verb '{first}'.{nearest(first, verbs)} {known}")
     args, rest = parser.parse_known_args(words)
-    _take_overrides(parser, args, rest)
+    args.debug = "debug" in args
+    if args.verb is None:
+        parser.error(f"{f'unknown: {rest[0]}' if rest else 'give a verb'}. {known}")
+    _take_overrides(verbs[args.verb], args, rest)
     return args
 
 
@@ -89,32 +92,41 @@ def _take_overrides(
     """Add words that argparse could not place to the overrides, or refuse them."""
     flags = [word for word in rest if word.startswith("-")]
     if rest and (flags or not hasattr(args, "overrides")):
-        hint = ""
+        hint = "."
+        if flags:
+            hint += nearest(flags[0], parser._option_string_actions)
         if hasattr(args, "overrides"):
-            hint = "; values of the recipe are written key=value, without dashes"
+            hint += " Values of the recipe are written key=value, without dashes."
         parser.error(f"unknown: {' '.join(flags or rest)}{hint}")
     if rest:
-        args.overrides += rest
+        args.overrides = [*args.overrides, *rest]
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of all verbs."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument(
-        "--debug", action="store_true", help="tracebacks and more detailed logs"
+        "--debug",
+        action="store_true",
+        default=argparse.SUPPRESS,  # or a verb would forget what stands before it
+        help="tracebacks and more detailed logs",
     )
     parser = argparse.ArgumentParser(
         prog="flashdex",
+        parents=[common],
+        allow_abbrev=False,
         description="From recorded human hand-object motions to robot-hand "
         "trajectories that hold up in physics.",
     )
     parser.add_argument(
         "--version", action="version", version=f"flashdex {flashdex.__version__}"
     )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB")
 
     def add(name: str, run: Handler, text: str) -> argparse.ArgumentParser:
-        verb = verbs.add_parser(name, help=text, description=text, parents=[common])
+        verb = verbs.add_parser(
+            name, help=text, description=text, parents=[common], allow_abbrev=False
+        )
         verb.set_defaults(run=run)
         return verb
 
@@ -122,8 +134,8 @@ def make_parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "recipe", nargs="?", help="say what memory this recipe needs instead"
     )
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
-    _add_allow(verb)
+    add_overrides(verb)
+    add_allow(verb)
     verb = add("ls", _ls, "list recipes and what they promise, options, sources, hands")
     verb.add_argument("--json", action="store_true", help="print JSON")
     _add_recipe_verbs(add)
@@ -132,21 +144,12 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_allow(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--allow",
-        action="append",
-        metavar="PACKAGE",
-        help="let the recipe name terms of this package of yours, which runs its code",
-    )
-
-
 def _add_recipe_verbs(
     add: Callable[[str, Handler, str], argparse.ArgumentParser],
 ) -> None:
     verb = add("cp", _cp, "copy a recipe, or an option of one, to edit it")
     verb.add_argument("recipe", help="name or path, or GROUP/OPTION: ablation/ppo")
-    verb.add_argument("dest", type=path, help="new file or folder")
+    verb.add_argument("dest", type=path_text, help="new file, or a folder")
 
     verb = add("validate", _validate, "find every mistake in recipes and options")
     verb.add_argument(
@@ -156,7 +159,7 @@ def _add_recipe_verbs(
         metavar="PATH",
         help="recipe, option of a group, or folder",
     )
-    _add_allow(verb)
+    add_allow(verb)
 
 
 def _add_run_verbs(
@@ -164,7 +167,7 @@ def _add_run_verbs(
 ) -> None:
     verb = add("train", _train, "train a recipe: train RECIPE key=value ...")
     verb.add_argument("recipe", nargs="?", help="name or path")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    add_overrides(verb)
     one = verb.add_mutually_exclusive_group()
     one.add_argument("--resume", type=path, metavar="RUN", help="continue a run")
     one.add_argument(
@@ -173,15 +176,16 @@ def _add_run_verbs(
     verb.add_argument(
         "--cfg", choices=["job"], help="print the composed recipe and stop"
     )
-    _add_allow(verb)
+    add_allow(verb)
 
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
-    _add_allow(verb)
+    _add_run(verb)
+    add_overrides(verb)
+    add_allow(verb)
 
     verb = add("replay", _replay, "replay the stored trajectories in MuJoCo C")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
+    _add_run(verb)
+    add_allow(verb)
 
     verb = add("score", _score, "score stored rollouts by every criterion")
     verb.add_argument(
@@ -190,21 +194,36 @@ def _add_run_verbs(
     verb.add_argument("--json", action="store_true", help="print JSON")
 
     verb = add("verify", _verify, "check every hash of runs and motion libraries")
-    verb.add_argument("paths", type=path, nargs="+", metavar="RUN|LIBRARY")
+    verb.add_argument(
+        "paths",
+        type=path,
+        nargs="+",
+        metavar="RUN|LIBRARY",
+        help="folder that `train` or `prepare` wrote",
+    )
+    add_allow(verb)
 
     verb = add("report", _report, "write report.html of a run again")
-    verb.add_argument("run_dir", type=path, metavar="RUN")
+    _add_run(verb)
+
+
+def _add_run(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "run_dir", type=path, metavar="RUN", help="folder that `train` wrote"
+    )
 
 
 def _doctor(args: argparse.Namespace) -> int:
     if args.recipe is not None:
         return _doctor_recipe(args)
+    is_whole = True
     with loading():
-        from flashdex.cli.doctor import examine, format_report
+        from flashdex.cli.doctor import examine
 
-        findings = examine()
-    say(format_report(findings))
-    return int(any(finding.status == "missing" for finding in findings))
+        for finding in examine():  # some take seconds
+            say(str(finding))
+            is_whole &= finding.status != "missing"
+    return int(not is_whole)
 
 
 def _doctor_recipe(args: argparse.Namespace) -> int:
@@ -234,6 +253,10 @@ def _cp(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
+    from flashdex.recipe.store import recipe_files
+
+    for given in args.paths:  # before anything large is loaded
+        recipe_files(given)
     with loading():
         from flashdex.recipe.merge import validate_paths
 
@@ -293,9 +316,6 @@ def _show_run(run_dir: Path) -> bool:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from flashdex.system.run_files import require_run
-
-    require_run(args.run_dir)  # before anything large is loaded
     with loading():
         from flashdex.reports.run.terminal import evaluation_table
         from flashdex.training.run_dir import evaluate
@@ -309,6 +329,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    if not (args.run_dir / ROLLOUTS).is_dir():  # they can be replayed without the rest
+        require_run(args.run_dir)
     with loading():
         from flashdex.recipe import require_motions
         from flashdex.reports.run.terminal import finding_lines, replay_line
@@ -327,8 +349,6 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from flashdex.system.run_files import require_run
-
     for folder in args.paths:  # before anything large is loaded
         require_run(folder, or_library=True)
     with loading():
@@ -343,12 +363,13 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _score(args: argparse.Namespace) -> int:
-    absent = [str(file) for file in args.files if not file.is_file()]
-    if absent:
-        raise FlashdexError(
-            f"{', '.join(absent)}: no such file. Name stored rollouts, "
-            "RUN/rollouts/*.npz; of a whole run 'flashdex replay RUN' tells more"
-        )
+    for file in args.files:
+        if not file.is_file() or not zipfile.is_zipfile(file):
+            fault = "is no .npz file" if file.is_file() else "there is no such file"
+            raise FlashdexError(
+                f"{file}: {fault}. Name stored rollouts, RUN/rollouts/*.npz; of a "
+                "whole run 'flashdex replay RUN' tells more."
+            )
     with loading():
         from flashdex.reports.run.terminal import finding_lines, score_table
         from flashdex.rollouts.findings import faults

@@ -9,9 +9,11 @@ lives elsewhere.
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib
 import re
 from pathlib import Path
+from typing import Any
 
 from flashdex.datasets.source import Recording, Source, SourceOptions, is_named
 from flashdex.errors import DemoError, UnknownSourceError
@@ -37,20 +39,21 @@ def source_names() -> list[str]:
 
 def describe_sources() -> dict[str, str]:
     """What each source reads, by its name; no reader is imported."""
-    found = {name: _about(file) for name, (file, _) in _files().items()}
-    found |= {name: source.about for name, source in REGISTERED.items()}
-    return {name: found[name] for name in source_names()}
+    return {name: _declared(name).about for name in source_names()}
 
 
-def _about(file: Path) -> str:
-    """The text ``about`` of a reader's ``SOURCE``, where it is written out."""
-    for line in ast.parse(file.read_text(encoding="utf-8")).body:
+def _declared(name: str) -> Source:
+    """What a reader says of itself, without importing it: it lists nothing."""
+    if name in REGISTERED:
+        return REGISTERED[name]
+    told: dict[str, Any] = {"name": name, "about": ""}
+    for line in ast.parse(_files()[name][0].read_text(encoding="utf-8")).body:
         call = line.value if isinstance(line, ast.Assign) else None
         if isinstance(call, ast.Call) and ast.unparse(call.func) == "Source":
-            texts = {k.arg: k.value for k in call.keywords}
-            if isinstance(about := texts.get("about"), ast.Constant):
-                return str(about.value)
-    return ""
+            for word in call.keywords:
+                with contextlib.suppress(ValueError):  # a function is no constant
+                    told[str(word.arg)] = ast.literal_eval(word.value)
+    return Source(**told, list=lambda _: [])
 
 
 def get_source(name: str) -> Source:
@@ -74,14 +77,16 @@ def _files() -> dict[str, tuple[Path, str]]:
     return found
 
 
-def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
-    """All recordings of a source, in a fixed order; none of them is read yet.
+def check_options(source: str, options: SourceOptions) -> None:
+    """Refuse options that a source cannot do with; no reader is imported.
 
     Raises:
         UnknownSourceError: names the known readers.
-        DemoError: an option is missing, or the root is not such a dataset.
+        DemoError: an option is missing, or names a place that is not there.
     """
-    reader = get_source(source)
+    if source not in source_names():
+        raise UnknownSourceError(source, source_names())
+    reader = _declared(source)
     missing = [name for name in reader.needs if getattr(options, name) is None]
     if missing:
         words = ["--input" if m == "path" else f"--{m}" for m in missing]
@@ -94,12 +99,22 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
         raise DemoError(f"{source}: no such file or folder: {path}")
     if options.limit is not None and options.limit < 1:
         raise DemoError(f"{source}: --limit is {options.limit}; at least 1 is needed.")
+
+
+def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
+    """All recordings of a source, in a fixed order; none of them is read yet.
+
+    Raises:
+        UnknownSourceError: names the known readers.
+        DemoError: an option is missing, or the root is not such a dataset.
+    """
+    check_options(source, options)
     try:
-        recordings = reader.list(options)
+        recordings = get_source(source).list(options)
     except OSError as error:  # a name too long, a folder that may not be entered
         raise DemoError(f"{source}: cannot be read: {error}.") from error
     if not recordings:
-        raise DemoError(f"{source}: no recordings in {path}.")
+        raise DemoError(f"{source}: no recordings in {options.path}.")
     return _select(recordings, options)
 
 
@@ -118,11 +133,3 @@ def _select(recordings: list[Recording], options: SourceOptions) -> list[Recordi
             return recordings
         chosen |= {name: r for name, r in found.items() if name not in chosen}
     return list(chosen.values())[: options.limit]
-
-
-def format_sources() -> str:
-    """One line a source: its name and what it reads."""
-    found = describe_sources()
-    width = max(map(len, found))
-    lines = [f"  {name:<{width}}  {about}" for name, about in found.items()]
-    return "\n".join(["recordings (flashdex prepare --source NAME):", *lines])

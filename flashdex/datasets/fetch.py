@@ -12,12 +12,12 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
 from flashdex.errors import DemoError, UnknownNameError
+from flashdex.system.children import PYTHON
 from flashdex.system.files import hash_file
 
 WHEEL = "myosuite==2.12.2"
@@ -62,6 +62,8 @@ def fetch(name: str, out: Path | None = None, *, wheel: Path | None = None) -> P
     """
     if name != "myodm":
         raise UnknownDatasetError(name, ["myodm"])
+    if wheel is not None and not wheel.is_file():
+        raise DemoError(f"--wheel: there is no file {wheel}.")
     out = out or myodm_dir()
     if _is_complete(out):
         return out
@@ -96,7 +98,7 @@ def _is_complete(folder: Path) -> bool:
 
 
 def _download(folder: Path) -> Path:
-    command = [sys.executable, "-P", "-m", "pip", "download", "--no-deps", "--quiet"]
+    command = [*PYTHON, "-m", "pip", "download", "--no-deps", "--quiet"]
     command += ["--disable-pip-version-check", "--dest", str(folder), WHEEL]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = list(folder.glob("*.whl"))

@@ -22,7 +22,8 @@ from flashdex.algorithms.base import config_class
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.mdp.term import KINDS, Kind, default_mapping, find_term, registry
 from flashdex.errors import FlashdexError, RecipeError, nearest
-from flashdex.recipe.schema import PATHS, RunRecipe
+from flashdex.recipe.overrides import PATHS
+from flashdex.recipe.schema import RunRecipe
 from flashdex.recipe.tasks import split_foreign
 
 R = TypeVar("R", bound=RunRecipe)
@@ -61,7 +62,15 @@ def read_recipe(data: Mapping[str, Any]) -> tuple[RunRecipe, list[str]]:
     # An algorithm may add keys.
     cls = config_class(algo.get("kind") if isinstance(algo, Mapping) else None)
     recipe = dataclasses.replace(recipe, algo=build_config(cls, algo, "algo", problems))
-    return recipe, problems + _find_names(recipe) + kind.find_conflicts(recipe)
+    noted = [problem.partition(": ")[0] for problem in problems]
+    found = _find_names(recipe) + kind.find_conflicts(recipe)
+    # what only the stand-in of a wrong value does not fit is no mistake
+    return recipe, problems + [f for f in found if not _names_any(f, noted)]
+
+
+def _names_any(problem: str, keys: Iterable[str]) -> bool:
+    """Whether a text speaks of one of some keys, not of one that begins like it."""
+    return any(re.search(rf"(?<![\w.]){re.escape(k)}(?![\w.])", problem) for k in keys)
 
 
 def _find_names(recipe: RunRecipe) -> list[str]:
@@ -101,6 +110,14 @@ def validate(recipe: R) -> R:
     if problems:
         raise RecipeError(problems, where=recipe.name)
     return typing.cast(R, complete)
+
+
+def check_option(cls: type, key: str, value: Any, *, where: str) -> None:
+    """Refuse one value of a dataclass whose other values have defaults."""
+    problems: list[str] = []
+    _build(cls, {key: value}, "", problems)
+    if problems:
+        raise RecipeError(problems, where=where)
 
 
 def _read_env(data: Any, problems: list[str]) -> EnvConfig:
@@ -144,9 +161,19 @@ def _read_terms(
     return result
 
 
-def _unknown(what: str, name: str, known: Iterable[str]) -> str:
+def _unknown(what: str, name: str, known: Iterable[str], below: str = "") -> str:
     allowed = ", ".join(known) or "none"
-    return f"unknown {what}.{nearest(name, known)} Allowed: {allowed}."
+    close = f" Did you mean '{below}'?" if below else nearest(name, known)
+    return f"unknown {what}.{close} Allowed: {allowed}."
+
+
+def _below(cls: type, key: str) -> str:
+    """Where a key is known that was written without its group; empty where nowhere."""
+    for group, hint in get_type_hints(cls).items():
+        inner = dataclasses.fields(hint) if dataclasses.is_dataclass(hint) else ()
+        if any(field.name == key for field in inner):
+            return f"{group}.{key}"
+    return ""
 
 
 @functools.cache
@@ -197,7 +224,7 @@ def _explain(cls: type, error: Any, path: str) -> tuple[str, str]:
     if kind == "unexpected_keyword_argument":
         known = [field.name for field in dataclasses.fields(_owner(cls, way[:-1]))]
         what = "argument" if path.startswith("env.") else "key"
-        return where, _unknown(what, way[-1], known)
+        return where, _unknown(what, way[-1], known, _below(cls, where))
     if kind == "literal_error":
         known = re.findall(r"'([^']*)'|\b(\d+)\b", limits["expected"])
         known = [text or digits for text, digits in known]

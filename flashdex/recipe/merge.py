@@ -14,11 +14,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from flashdex.errors import FlashdexError, RecipeError, nearest
+from flashdex.errors import FlashdexError, RecipeError
 from flashdex.recipe.check import read_recipe
 from flashdex.recipe.overrides import (
     Change,
     apply_changes,
+    as_options,
+    choice_problems,
     expand_home,
     expand_sweeps,
     fill_in,
@@ -28,10 +30,10 @@ from flashdex.recipe.overrides import (
 from flashdex.recipe.reader import parse_yaml, read_text
 from flashdex.recipe.schema import Recipe, RunRecipe
 from flashdex.recipe.store import (
-    find_option,
     find_recipe,
     group_of,
     known_groups,
+    recipe_files,
     search_dirs,
 )
 from flashdex.recipe.tasks import kind_of, mark_groups
@@ -61,10 +63,10 @@ class _Composer:
             if change.key not in self.groups:
                 others.append(change)
                 continue
-            options = None if change.is_delete else _options(change.value)
-            good = [self._exists(change.key, option) for option in options or ()]
-            if all(good):
-                self.chosen[change.key] = options
+            found = choice_problems(self.groups, change.key, change.options)
+            self.problems += found
+            if not found:
+                self.chosen[change.key] = change.options
         return others
 
     def compose(self, path: Path) -> dict[str, Any]:
@@ -122,7 +124,7 @@ class _Composer:
             for key, value in entry.items() if isinstance(entry, dict) else ():
                 words = str(key).replace("/", " ").split()
                 if words[:-1] == ["override"]:
-                    self.chosen.setdefault(words[-1], _options(value))
+                    self.chosen.setdefault(words[-1], as_options(value))
 
     def _entry(
         self, where: str, entry: Any, before: list[Any], group: str | None
@@ -140,7 +142,7 @@ class _Composer:
         self._check_words(name, words, "_self_" in before)
         if words == ["override"] and name in self.used:
             return {}  # the file that names the group has it already
-        return self._group(name, _options(value))
+        return self._group(name, as_options(value))
 
     def _check_words(self, group: str, words: list[str], has_self: bool) -> None:
         """Note the ways in which a choice would be dropped without a word."""
@@ -167,38 +169,16 @@ class _Composer:
         """The options of a group that are chosen, or else named."""
         options = self.chosen.get(group, named)
         self.used[group] = options
+        self.problems += choice_problems(self.groups, group, options)
         merged: dict[str, Any] = {}
         for option in options or ():
-            if self._exists(group, option):
+            if option in self.groups.get(group, ()):
                 merged = merge(merged, self._load(self._find(group, option), group))
         return merged
 
     def _find(self, group: str, option: str) -> Path:
         paths = [folder / group / f"{option}.yaml" for folder in self.dirs]
         return next(path for path in paths if path.is_file())
-
-    def _exists(self, group: str, option: str) -> bool:
-        """Note a group or an option that does not exist; say whether both do."""
-        known = self.groups
-        if group not in known:
-            self.problems.append(
-                f"defaults.{group}: unknown group.{nearest(group, known)} "
-                f"Allowed: {', '.join(known)}."
-            )
-        elif option not in known[group]:
-            self.problems.append(
-                f"{group}={option}: there is no such {group}."
-                f"{nearest(option, known[group])} Allowed: {', '.join(known[group])}."
-            )
-        else:
-            return True
-        return False
-
-
-def _options(value: Any) -> list[str] | None:
-    if value is None:
-        return None
-    return [str(option) for option in (value if isinstance(value, list) else [value])]
 
 
 def compose(
@@ -241,8 +221,13 @@ def inspect_recipe(
     name_or_path: str | Path,
     overrides: Sequence[str] = (),
 ) -> tuple[RunRecipe, list[str]]:
-    """Compose without raising: the recipe (unusable with problems) and the problems."""
+    """The recipe (unusable with problems) and the problems.
+
+    Raises:
+        FlashdexError: there is no such file, or it cannot be read.
+    """
     path = find_recipe(name_or_path)
+    parse_yaml(read_text(path), where=path.name)  # what else could be said is not true
     changes, problems = parse_overrides(overrides)
     composer = _Composer(path.parent, problems)
     changes = composer.choose(changes)
@@ -332,7 +317,7 @@ def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
     Returns:
         The files that were checked.
     """
-    files = [file for path in paths for file in _files(path)]
+    files = [file for path in paths for file in recipe_files(path)]
     problems = []
     for file in files:
         problems += [f"{file}: {problem}" for problem in _problems_of(file)]
@@ -344,15 +329,6 @@ def validate_paths(paths: Sequence[str | Path]) -> list[Path]:
 def _problems_of(file: Path) -> list[str]:
     try:
         group = group_of(file)
+        return inspect_option(file, group) if group else inspect_recipe(file)[1]
     except RecipeError as error:
         return error.problems
-    return inspect_option(file, group) if group else inspect_recipe(file)[1]
-
-
-def _files(path: str | Path) -> list[Path]:
-    if not Path(path).is_dir():
-        return [find_option(path) or find_recipe(path)]
-    files = sorted(Path(path).glob("*.yaml"))
-    if not files:
-        raise FlashdexError(f"{path}: no recipe (*.yaml) in this folder")
-    return files

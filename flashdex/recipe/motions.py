@@ -6,7 +6,9 @@ These dataclasses are the one place of defaults. Metres, radians, seconds, kilog
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
 
 from flashdex.datasets import source_names
 from flashdex.system.fields import SEED_MAX, number
@@ -33,7 +35,7 @@ class MotionsConfig:
     """Folder of the object models, where it lies apart from the recordings."""
     speed: float = number(1.0, low=0.01, high=100)
     """Playback speed of the recordings; 0.5 makes a motion last twice as long."""
-    select: list[str] | None = None
+    select: Annotated[list[str], Field(min_length=1)] | None = None
     """Names or globs of the motions to keep; null keeps all."""
     count: int | None = number(None, low=1, high=10**6)
     """How many motions to keep or, for procedural ones, to make; null = all."""

@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,8 +19,10 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from flashdex.errors import RecipeError, nearest
-from flashdex.recipe.schema import PATHS
+from flashdex.recipe.store import find_recipe, known_groups
 
+PATHS = ("run_dir", *(f"motions.{k}" for k in ("library", "input", "mano", "models")))
+"""Keys whose value is a path, whatever is in it."""
 MAX_RUNS = 1000
 _MAX_LENGTH = 100_000
 _LITERAL = re.compile(r"\+{0,2}([A-Za-z_][\w.]*)=(.*)", re.DOTALL)
@@ -34,6 +37,18 @@ class Change:
     key: str  # path of a value, or a group
     value: Any = None
     is_delete: bool = False
+
+    @property
+    def options(self) -> list[str] | None:
+        """What it chooses where its key is a group; None takes the group out."""
+        return None if self.is_delete else as_options(self.value)
+
+
+def as_options(value: Any) -> list[str] | None:
+    """The options that a value names: none, one, or several."""
+    if value is None:
+        return None
+    return [str(option) for option in (value if isinstance(value, list) else [value])]
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[list[Change], list[str]]:
@@ -113,6 +128,51 @@ def _choices(text: str) -> list[str]:
         problem = "give the values one by one, key=a,b, or as key=range(1,4)"
         raise RecipeError([f"override '{_short(text)}': {problem}"]) from error
     return [f"{found.get_key_element()}={value}" for value in values]
+
+
+def check_words(name: str | Path, runs: Sequence[Sequence[str]]) -> None:
+    """Refuse what the words alone show, before the schema, with torch, is loaded.
+
+    Args:
+        name: of a recipe, or its path.
+        runs: overrides of each run.
+
+    Raises:
+        FlashdexError: there is no such recipe or option, or a word is not understood.
+    """
+    groups = known_groups(find_recipe(name).parent)
+    problems: dict[str, None] = {}  # runs of a grid share most of their words
+    for texts in runs:
+        changes, found = parse_overrides(texts)
+        chosen = [c for c in changes if c.key in groups]
+        found += [p for c in chosen for p in choice_problems(groups, c.key, c.options)]
+        problems |= dict.fromkeys(found)
+    if problems:
+        raise RecipeError(list(problems), where=f"recipe {name}")
+
+
+def choice_problems(
+    groups: Mapping[str, Sequence[str]], group: str, options: Sequence[str] | None
+) -> list[str]:
+    """Say that a group or an option does not exist.
+
+    Args:
+        groups: options of each group.
+        group: that was chosen from.
+        options: that were chosen.
+    """
+    known = groups.get(group)
+    if known is None:
+        return [
+            f"defaults.{group}: unknown group.{nearest(group, groups)} "
+            f"Allowed: {', '.join(groups)}."
+        ]
+    return [
+        f"{group}={option}: there is no such {group}."
+        f"{nearest(option, known)} Allowed: {', '.join(known)}."
+        for option in options or ()
+        if option not in known
+    ]
 
 
 def merge(below: Any, above: Any) -> Any:

@@ -13,9 +13,6 @@ from flashdex.recipe.motions import MotionsConfig
 from flashdex.recipe.run import LoggerConfig, TrainConfig
 from flashdex.system.fields import SEED_MAX, number
 
-PATHS = ("run_dir", *(f"motions.{k}" for k in ("library", "input", "mano", "models")))
-"""Keys whose value is a path, whatever is in it."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Expectation:

@@ -5,6 +5,7 @@ Nothing here imports the schema, which would import torch.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from flashdex.errors import (
     RecipeError,
     UnknownOptionError,
     UnknownRecipeError,
+    nearest,
 )
 from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
 
@@ -47,8 +49,9 @@ def package_dir() -> Path:
 
 def search_dirs() -> list[Path]:
     """Return the folders a name is looked up in, first match wins."""
-    local = Path.cwd() / "recipes"
-    dirs = [local.resolve(), package_dir().resolve()]
+    dirs = [package_dir().resolve()]
+    with contextlib.suppress(FileNotFoundError):  # the folder we are in was removed
+        dirs.insert(0, Path("recipes").resolve())
     return [d for i, d in enumerate(dirs) if d.is_dir() and d not in dirs[:i]]
 
 
@@ -64,13 +67,25 @@ def find_recipe(name_or_path: str | Path) -> Path:
         if is_file(path):
             return path.resolve()
         raise FlashdexError(
-            f"recipe {path}: there is no such file. Give the path of a YAML file or "
-            f"one of the names that `flashdex ls` lists."
+            f"recipe {path}: there is no such file.{_what_was_meant(path)} Give the "
+            f"path of a YAML file or one of the names that `flashdex ls` lists."
         )
     for folder in search_dirs():
         if is_file(folder / f"{text}.yaml"):
             return folder / f"{text}.yaml"
     raise UnknownRecipeError(text, [entry.name for entry in list_recipes()])
+
+
+def _what_was_meant(path: Path) -> str:
+    """A hint for who gave a path at which no recipe lies."""
+    if is_file(path / "recipe.yaml"):
+        return f" It is the folder of a run, whose recipe is {path / 'recipe.yaml'}."
+    named = str(path.with_suffix(""))
+    names = [f"{group}/{o}" for group, some in known_groups().items() for o in some]
+    if named in names:
+        return f" It is an option: add {named.replace('/', '=')} to a recipe."
+    names += [entry.name for entry in list_recipes()]
+    return nearest(named, names) or nearest(path.stem, names)
 
 
 def is_file(path: Path) -> bool:
@@ -91,6 +106,20 @@ def find_option(name: str | Path) -> Path | None:
     if group in known and option and not is_file(Path(name)):
         raise UnknownOptionError(option, known[group], where=group)
     return None
+
+
+def recipe_files(path: str | Path) -> list[Path]:
+    """Return the file of a recipe or an option, or the YAML files of a folder.
+
+    Raises:
+        FlashdexError: there is none.
+    """
+    if not Path(path).is_dir():
+        return [find_option(path) or find_recipe(path)]
+    files = sorted(Path(path).glob("*.yaml"))
+    if not files:
+        raise FlashdexError(f"{path}: no recipe (*.yaml) in this folder")
+    return files
 
 
 def group_of(path: Path) -> str | None:
@@ -188,14 +217,14 @@ def copy_recipe(name_or_path: str | Path, destination: str | Path) -> Path:
 
     Args:
         name_or_path: the recipe, or `group/option`.
-        destination: a new file, or an existing folder.
+        destination: a new file, or a folder: one that exists or ends with a slash.
 
     Returns:
         The new file.
     """
     source = find_option(name_or_path) or find_recipe(name_or_path)
     text, target = read_text(source), Path(destination)
-    if target.is_dir():
+    if target.is_dir() or str(destination).endswith("/"):
         target = target / source.name
     if target.suffix not in (".yaml", ".yml"):
         target = target.with_name(f"{target.name}.yaml")

@@ -12,7 +12,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ from flashdex.errors import FlashdexError, RunError
 from flashdex.rollouts.build import RolloutBuilder
 from flashdex.rollouts.ledger import Ledger
 from flashdex.rollouts.recorder import Episode
+from flashdex.system.children import spawning_pool
 
 if TYPE_CHECKING:
     from flashdex.recipe import Recipe
@@ -81,10 +82,7 @@ class ProcessScorer:
 
     def __init__(self, ledger: Ledger, spec: ScorerSpec, make: MakeScorer) -> None:
         self.ledger = ledger
-        # A fork would share the GPU's state. One process: lines keep their order.
-        self._pool = ProcessPoolExecutor(
-            1, mp_context=mp.get_context("spawn"), initializer=_live_with_parent
-        )
+        self._pool = spawning_pool(1, _live_with_parent)  # one: lines keep their order
         self._opened: Future[None] | None = self._pool.submit(_open, spec, make)
         self._line: deque[Future[dict[str, Any]]] = deque()
 

@@ -163,7 +163,18 @@ def _keep_changes(run_dir: Path) -> None:
 
 
 def refuse_old_run(run_dir: Path) -> None:
-    """Raise a RunError when the folder holds a run, or what is left of one."""
+    """Refuse a folder that holds a run, or what is left of one, or cannot be made.
+
+    Raises:
+        RunError: it says which.
+    """
+    way = run_dir.absolute()
+    place = next(p for p in (way, *way.parents) if os.path.lexists(p))
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        raise RunError(
+            f"{run_dir}: cannot be written ({place} is no folder, or one that may not "
+            "be changed). Choose another folder with run_dir=..."
+        )
     left = [name for name in TRACES if os.path.lexists(run_dir / name)]
     if RECIPE in left:
         raise RunError(

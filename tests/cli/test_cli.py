@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import flashdex
-from flashdex.cli.doctor import Finding, examine, format_report
+from flashdex.cli.doctor import Finding, examine
 from flashdex.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -46,20 +46,33 @@ def test_a_user_error_is_two_and_goes_to_stderr(run):
     assert "Did you mean 'quickstart'?" in err
 
 
-def test_debug_shows_the_traceback():
+@pytest.mark.parametrize("words", [["train", "--debug"], ["--debug", "train"]])
+def test_debug_shows_the_traceback(words):
     with pytest.raises(flashdex.errors.FlashdexError):
-        main(["train", "quickstrat", "--debug"])
+        main([*words, "quickstrat"])
 
 
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        ([], "required"),
+        ([], "give a verb. Verbs: doctor, ls, "),
+        (["--verison"], "unknown: --verison. Verbs: doctor, ls, "),
         (["trian"], "Did you mean 'train'?"),
+        (["TRAIN"], "Did you mean 'train'?"),
+        (["ls", "--jsno"], "unknown: --jsno. Did you mean '--json'?"),
+        (["validate", "quickstart", "--all"], "unknown: --all"),
+        (["evaluate"], "required: RUN\n"),
+        (["cp", "quickstart.yml", "x"], "Did you mean 'quickstart'?"),
+        (["train", "ablation/ppo"], "It is an option: add ablation=ppo to a recipe"),
+        (["cp", "ablations/no_futur", "x"], "Did you mean 'ablation/no_future'?"),
+        (["fetch", "myodm", "--wheel", "/nowhere"], "there is no file /nowhere"),
         (["train"], "give a recipe"),
         (["train", "quickstart", "--lr", "3"], "key=value, without dashes"),
         (["ls", "something"], "unknown: something"),
         (["train", "quickstart", "env.num_env=3"], "Did you mean 'num_envs'?"),
+        (["train", "quickstart", "num_envs=3"], "Did you mean 'env.num_envs'?"),
+        (["train", "quickstart", "motions.select=[]"], "expected at least 1 entries"),
+        (["train", "quickstart", "algo.lr=3k"], "1 problem\n  1. algo.lr: expected"),
         (["train", "quickstart", "algo.init_std=1.0"], "must be at most 0.99"),
         (["train", "quickstart", "algo.init_std=0.0067"], "must be at least 0.007"),
         (["train", "--resume", "/nowhere"], "not a run directory"),
@@ -69,7 +82,7 @@ def test_debug_shows_the_traceback():
         (["score", "/nowhere/x.npz"], "no such file"),
         (["score"], "required"),
         (["report", "/nowhere"], "not a run directory"),
-        (["replay", "/nowhere"], "no stored rollout"),
+        (["replay", "/nowhere"], "not a run directory"),
         (["replay", "/nowhere", "more"], "unknown: more"),
     ],
 )
@@ -140,6 +153,25 @@ def test_cp_then_validate(run, tmp_path):
     assert "env.num_env: unknown key" in err
 
 
+def test_the_folder_of_a_run_is_no_recipe(run, tmp_path):
+    (tmp_path / "recipe.yaml").write_text("seed: 1")
+    code, _, err = run("train", f"{tmp_path}/")
+    assert code == 2
+    assert f"whose recipe is {tmp_path}/recipe.yaml." in err
+
+
+def test_a_folder_that_was_removed_under_us_hides_no_recipes(
+    run, tmp_path, monkeypatch
+):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "here").rmdir()
+    code, out, _ = run("ls")
+    assert (code, "quickstart" in out) == (0, True)
+    code, _, err = run("cp", "quickstart", "x.yaml")
+    assert (code, "cannot be written" in err) == (2, True)
+
+
 def test_cp_below_a_file_says_so(run, tmp_path):
     (tmp_path / "file").write_text("mine")
     code, _, err = run("cp", "quickstart", str(tmp_path / "file/x"))
@@ -156,11 +188,11 @@ def test_processes_of_a_command_import_nothing_from_the_folder_we_are_in(
 
 
 def test_doctor_looks_at_everything():
-    findings = examine()
+    findings = list(examine())
     subjects = {finding.what for finding in findings}
     assert {"python", "cpu", "gpu", "graphics", "disk"} <= subjects
-    report = format_report([*findings, Finding("missing", "torch", "run: pip")])
-    assert report.count("MISSING") == 1 + sum(f.status == "missing" for f in findings)
+    assert str(Finding("missing", "torch", "run: pip")).startswith("MISSING  torch ")
+    assert all(str(f).split()[0] in ("ok", "note", "MISSING") for f in findings)
 
 
 def test_versions_agree():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
@@ -13,9 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from flashdex.cli import interrupt
 from flashdex.cli.interrupt import INTERRUPTED, loading
 from flashdex.cli.main import main
 from flashdex.cli.terminal import Formatter, say
+from flashdex.cli.terminal import path as terminal_path
 from flashdex.errors import RecipeError
 
 ROOT = Path(__file__).parents[2]
@@ -102,6 +105,23 @@ def test_what_ignores_interrupts_still_does():
     assert run_python(code)[:2] == (0, "went on\n")
 
 
+def test_somebody_at_a_terminal_is_told_what_takes_long(monkeypatch):
+    terminal = io.StringIO()
+    monkeypatch.setattr(interrupt, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    for is_terminal, told in ((False, ""), (True, "loading libraries ...\n")):
+        monkeypatch.setattr(terminal, "isatty", lambda a=is_terminal: a)
+        with loading():
+            time.sleep(0.1)
+        assert terminal.getvalue() == told
+
+
+def test_the_home_folder_may_be_written_as_in_a_shell(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    assert terminal_path("~/a") == Path("/home/of/mine/a")
+    assert terminal_path("a/~/b") == Path("a/~/b")
+
+
 def test_loading_leaves_the_handler_as_it_was():
     before = signal.getsignal(signal.SIGINT)
     with loading():
@@ -152,6 +172,25 @@ QUICK = {
     "score_nothing_there": (["score", "/nowhere/a.npz"], 2),
     "baselines_out": (["baselines", "quickstart", "--out", "/nowhere/a.json"], 2),
     "cp": (["cp", "quickstrat", "mine.yaml"], 2),
+    "prepare_no_mano": (
+        ["prepare", "--source", "grab", "--input", "/", "--out", "a"],
+        2,
+    ),
+    "prepare_out_is_a_file": (
+        ["prepare", "--source", "procedural", "--out", "/dev/null"],
+        2,
+    ),
+    "train_unknown": (["train", "quickstrat"], 2),
+    "train_option": (["train", "quickstart", "ablation=no_futur"], 2),
+    "train_grid": (["train", "quickstart", "-m", "seed=interval(0,1)"], 2),
+    "train_word": (["train", "quickstart", "seed"], 2),
+    "resume_no_run": (["train", "--resume", "/nowhere"], 2),
+    "replay_no_run": (["replay", "/nowhere"], 2),
+    "report_no_run": (["report", "/nowhere"], 2),
+    "validate_unknown": (["validate", "quickstrat"], 2),
+    "doctor_unknown": (["doctor", "quickstrat"], 2),
+    "baselines_option": (["baselines", "quickstart", "physics=wrap"], 2),
+    "score_no_archive": (["score", "/dev/null", __file__], 2),
 }
 
 
@@ -227,6 +266,13 @@ def test_cp_never_writes_over_anything(target, make, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     assert exit_code("cp", "quickstart", str(tmp_path / target)) == 2
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_cp_into_a_folder_that_a_slash_says_to_make(tmp_path):
+    assert exit_code("cp", "quickstart", f"{tmp_path}/new/") == 0
+    assert exit_code("cp", "real_cpu", f"{tmp_path}/new/") == 0
+    names = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert names == ["quickstart.yaml", "real_cpu.yaml"]
 
 
 @pytest.mark.parametrize("word", ["seed=nan", "motions.library=/nowhere"])

@@ -53,7 +53,7 @@ def test_every_reader_is_called_like_its_source():
 
 def test_a_dataset_is_one_file(tmp_path, toy):
     assert toy in source_names()
-    assert "toy" in datasets.format_sources()
+    assert "toy" in datasets.describe_sources()
     with pytest.raises(UnknownSourceError, match=r"toy.*Did you mean 'toy'"):
         get_source("tooy")
     settings = MotionSettings(cache_dir=tmp_path / "cache", control_hz=30.0)

@@ -115,7 +115,7 @@ def test_score_prints_a_table_a_file(call, run_dir):
     ("verb", "expected"),
     [
         ("report", "not a run directory"),
-        ("replay", "no stored rollout"),
+        ("replay", "not a run directory"),
         ("score", "no such file"),
         ("evaluate", "not a run directory"),
     ],

@@ -16,6 +16,7 @@ from flashdex.system.run_files import (
     REPLAY,
     check_run,
     read_metrics,
+    refuse_old_run,
     remove_temporaries,
 )
 
@@ -149,3 +150,13 @@ def test_a_record_is_finite_numbers(tmp_path, line):
     append_line(tmp_path / METRICS, line)
     with pytest.raises(RunError, match="line 1"):
         read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["file", "file/run", "file/a/run", "link"])
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(name, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    with pytest.raises(RunError, match="cannot be written"):
+        refuse_old_run(tmp_path / name)
+    refuse_old_run(tmp_path / "new" / "run")
+    assert not (tmp_path / "new").exists()

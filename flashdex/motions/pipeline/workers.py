@@ -34,6 +34,7 @@ from flashdex.motions.pipeline.motion import (
 )
 from flashdex.motions.pipeline.stage import listening, tell
 from flashdex.objects.mesh_files import MESH_SUFFIXES
+from flashdex.system.children import spawning_pool
 
 _LOG = logging.getLogger(__name__)
 
@@ -189,9 +190,7 @@ def _run_pool(
 def _pool(workers: int) -> ProcessPoolExecutor:
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")  # read by the libraries when they load
-    # spawn: a fork of a process that runs torch threads can hang
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
+    return spawning_pool(workers, _start_worker)
 
 
 def _start_worker() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flashdex.errors import RunError
+from flashdex.system.children import PYTHON
 from flashdex.system.files import open_plain, own_file, own_folder
 from flashdex.system.run_files import FILMS as FOLDER
 
@@ -21,7 +22,8 @@ _SECONDS_A_FILM = 120
 _PROBE = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco><worldbody>"
     '<geom size=".1"/></worldbody></mujoco>\'); r = mujoco.Renderer(m, 16, 16); '
-    "d = mujoco.MjData(m); mujoco.mj_forward(m, d); r.update_scene(d); r.render()"
+    "d = mujoco.MjData(m); mujoco.mj_forward(m, d); r.update_scene(d); "
+    "assert r.render().max() > 0"  # one that draws nothing is none
 )
 
 
@@ -111,12 +113,17 @@ def _draw_films(rollouts: list[Path]) -> str:
 @functools.cache
 def find_backend() -> str | None:
     """First value of MUJOCO_GL that draws on this computer; what the user set wins."""
-    asked = os.environ.get("MUJOCO_GL")
-    usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("glfw",)
-    for backend in (asked,) if asked else usual:
+    for backend in usual_backends():
         if not run_drawer(["-c", _PROBE], backend, timeout=60):
             return backend
     return None
+
+
+def usual_backends() -> tuple[str, ...]:
+    """Values of MUJOCO_GL that may draw here without a screen."""
+    if asked := os.environ.get("MUJOCO_GL"):
+        return (asked,)
+    return ("egl", "osmesa") if sys.platform.startswith("linux") else ("glfw",)
 
 
 def run_drawer(words: list[str], backend: str, *, timeout: float) -> str:
@@ -131,8 +138,7 @@ def run_drawer(words: list[str], backend: str, *, timeout: float) -> str:
     }
     try:
         done = subprocess.run(
-            # -P: what lies in the folder we are in is data, not code
-            [sys.executable, "-P", *words],
+            [*PYTHON, *words],
             env=environment,
             capture_output=True,
             text=True,

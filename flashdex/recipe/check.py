@@ -115,7 +115,7 @@ def validate(recipe: R) -> R:
 def check_option(cls: type, key: str, value: Any, *, where: str) -> None:
     """Refuse one value of a dataclass whose other values have defaults."""
     problems: list[str] = []
-    _build(cls, {key: value}, "", problems)
+    build_config(cls, {key: value}, "", problems)
     if problems:
         raise RecipeError(problems, where=where)
 

@@ -18,7 +18,12 @@ import flashdex
 from flashdex.cli.data import Handler, add_data_verbs
 from flashdex.cli.interrupt import INTERRUPTED, loading
 from flashdex.cli.terminal import Formatter, path, say, set_up_streams
-from flashdex.errors import FlashdexError, MissingExtraError, nearest
+from flashdex.errors import (
+    FlashdexError,
+    MissingExtraError,
+    is_of_machine,
+    nearest,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,10 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `flashdex ls | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (OSError, MemoryError) as error:
-        if args.debug:
+    except Exception as error:
+        if args.debug or not (isinstance(error, OSError) or is_of_machine(error)):
             raise
-        told = str(error) or "no memory is left"
+        told = (str(error) or "no memory is left").splitlines()[0]
         say(f"flashdex {args.verb}: disk or memory failed: {told}", error=True)
         return 2
 

@@ -169,10 +169,10 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
         if is_of_machine(error):
             raise
         raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except MemoryError:
-        raise
     # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
     except Exception as error:
+        if is_of_machine(error):
+            raise
         told = " ".join(str(error).split())[:200] or type(error).__name__
         raise DemoError(
             f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "

@@ -50,7 +50,7 @@ def check_archive(file: Path | IO[bytes], *, limit: int = MAX_BYTES) -> None:
             check_sizes(archive, limit=limit)
             damaged = archive.testzip()
     # damaged bytes make zipfile and zlib raise nearly any exception
-    except (OSError, ValueError):
+    except (OSError, MemoryError, ValueError):
         raise
     except Exception as error:
         raise ValueError(f"not a whole archive ({error})") from error
@@ -74,7 +74,7 @@ def read_npz(path: Path, *, limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
                 raise ValueError(f"not an archive of arrays: {odd[:1] or names[:1]}")
             # reading to the end compares the checksum
             content = {n.removesuffix(".npy"): archive.read(n) for n in names}
-    except (OSError, ValueError):
+    except (OSError, MemoryError, ValueError):
         raise
     except Exception as error:
         raise ValueError(f"not a whole archive ({error})") from error

@@ -39,9 +39,9 @@ def write_tensors(content: Any, root: Path, *parts: str) -> None:
         sink = _Sink(file)
         try:
             torch.save(content, sink)  # type: ignore[arg-type]
-        except RuntimeError:
+        except RuntimeError as error:
             # torch's writer makes a RuntimeError of its own of a failed write
-            raise sink.fault or OSError("the tensors cannot be written") from None
+            raise sink.fault or OSError(str(error).splitlines()[0]) from None
         _seal(file)
 
 

@@ -328,7 +328,7 @@ FAILS = [("checkpoint", name) for name in MACHINE]
 FAILS += [("rows", "disk"), ("rows", "torch"), ("loop", "torch")]
 
 
-@pytest.mark.parametrize(("place", "failure"), FAILS, ids="-".join)
+@pytest.mark.parametrize(("place", "failure"), FAILS)
 def test_a_machine_that_fails_says_nothing_of_the_files(
     place, failure, run_dir, gym_run, use, monkeypatch, results
 ):

@@ -57,14 +57,24 @@ _OF_THE_DATA = {
 }
 
 
-def is_of_machine(error: BaseException) -> bool:
-    """Whether memory or a disk failed: nothing is said about the data.
+# torch and MuJoCo have no type for it that every version and device shares
+_NO_MEMORY = ("allocate memory", "out of memory", "bad_alloc", "start new thread")
+_NO_MEMORY += ("error -4 while",)  # of zlib
+
+
+def is_of_machine(error: BaseException | None) -> bool:
+    """Whether memory or a disk failed, here or in the cause: nothing about the data.
 
     The same call may go well the next time, so nobody turns it into a fault of the
     data, and nobody keeps it.
     """
-    is_disk = isinstance(error, OSError) and error.errno not in _OF_THE_DATA
-    return is_disk or isinstance(error, MemoryError)
+    if error is None or isinstance(error, MemoryError):
+        return error is not None
+    if isinstance(error, OSError):
+        return error.errno not in _OF_THE_DATA
+    if isinstance(error, FlashdexError):
+        return is_of_machine(error.__cause__)
+    return any(words in str(error).lower() for words in _NO_MEMORY)
 
 
 class UnknownNameError(FlashdexError):

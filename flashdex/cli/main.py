@@ -25,7 +25,12 @@ from flashdex.cli.terminal import (
     set_up_logging,
     set_up_streams,
 )
-from flashdex.errors import FlashdexError, MissingExtraError, nearest
+from flashdex.errors import (
+    FlashdexError,
+    MissingExtraError,
+    is_of_machine,
+    nearest,
+)
 from flashdex.system.run_files import ROLLOUTS, require_run
 
 
@@ -62,10 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `flashdex ls | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (OSError, MemoryError) as error:
-        if args.debug:
+    except Exception as error:
+        if args.debug or not (isinstance(error, OSError) or is_of_machine(error)):
             raise
-        told = str(error) or "no memory is left"
+        told = (str(error) or "no memory is left").splitlines()[0]
         say(f"flashdex {args.verb}: disk or memory failed: {told}", error=True)
         return 2
 

@@ -87,12 +87,12 @@ def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[
     """
     try:
         yield
-    except OSError as error:
+    except (OSError, *BROKEN) as error:
         if is_of_machine(error):
             raise
-        text = f"{where}: cannot be read: {error.strerror or error}."
-        raise DemoError(text, code="E_FILE") from error
-    except BROKEN as error:
+        if isinstance(error, OSError):
+            text = f"{where}: cannot be read: {error.strerror or error}."
+            raise DemoError(text, code="E_FILE") from error
         shown = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise DemoError(f"{where}: {fault}: {shown}.", code=code) from error
 
@@ -165,14 +165,13 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
             f"dataset is published.",
             code="E_PICKLE",
         ) from error
-    except OSError as error:
-        if is_of_machine(error):
-            raise
-        raise DemoError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except MemoryError:
-        raise
     # Damaged bytes make pickle, zipfile, numpy and torch raise nearly any exception.
     except Exception as error:
+        if is_of_machine(error):
+            raise
+        if isinstance(error, OSError):
+            text = f"{path}: cannot be read: {error.strerror or error}"
+            raise DemoError(text) from error
         told = " ".join(str(error).split())[:200] or type(error).__name__
         raise DemoError(
             f"{path}: not a readable {kind}: {told}. It is damaged or incomplete, or "

@@ -44,7 +44,7 @@ from flashdex.system.names import check_name, file_stem
 NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
 # folders of a library's data, the one that is being written too
 DATA = re.compile(r"\.?data-[0-9a-f]{16}")
-TEMPORARY = re.compile(r"\.manifest\.json\.\d+\.tmp")
+TEMPORARY = re.compile(r"\.(manifest\.json|report\.html)\.\d+\.tmp")
 LOCK, REPORT, PAGE = ".library.lock", "report.csv", "report.html"
 # what schema 1 kept beside its manifest
 OLD_PARTS = ("frames", "motions", "objects", "quality", "meshes")

@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from flashdex.errors import RunError
+from flashdex.errors import RunError, is_of_machine
 from flashdex.replay.buffer import RowBuffer
 from flashdex.replay.codec import row_bytes
 from flashdex.system.files import own_files, own_folder, remove_own
@@ -198,6 +198,8 @@ class ReplayLog:
                 return False
             self._fill(manifest, segments)
         except Exception as error:
+            if is_of_machine(error):
+                raise
             _LOG.warning(
                 "replay rows of checkpoint %s cannot be read (%s): the policy fills "
                 "the buffer again",

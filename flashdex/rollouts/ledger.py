@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.metrics.criteria import (
     criterion_names,
     moves_too_little,
@@ -161,6 +161,8 @@ class Ledger(Tally):
             model = mujoco.MjModel.from_xml_string(xml) if is_own else None
             certificate = certify(rollout, model=model)
         except (FlashdexError, ValueError) as error:
+            if is_of_machine(error):
+                raise
             _LOG.warning("%s: not certified: %s", rollout.motion, error)
             return {**out, "certified": False, "verdict": "not_measured"}
         certificate.save(proof)
@@ -206,6 +208,8 @@ class Ledger(Tally):
                 if finding.is_fault:
                     raise RunError(f"{finding}.")
         except FlashdexError as error:
+            if is_of_machine(error):
+                raise
             _LOG.warning("%s It is left as it is; 'flashdex verify' tells more", error)
             return False
         self.record(rollout, wall_s=wall_s, is_own=False)

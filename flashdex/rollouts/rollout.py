@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria import score, worst_movement
 from flashdex.metrics.criteria_table import (
@@ -282,6 +282,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         data = read_npz(path, limit=MAX_BYTES)
     except (ValueError, OSError) as error:
+        if is_of_machine(error):
+            raise
         raise RunError(
             f"{path}: not a readable rollout ({error}). It must be an .npz of plain "
             "arrays, without pickled objects, of at most 256 MiB."

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.metrics.criteria import criterion_names, stays_behind
 from flashdex.metrics.tally import UNMOVED
 from flashdex.recipe import Recipe
@@ -224,6 +224,8 @@ class _RunCheck:
         try:
             new = json.loads(certify(rollout, model=check.model).to_json())
         except (FlashdexError, ValueError) as error:
+            if is_of_machine(error):
+                raise
             return "not_measured", stored, [*found, Finding(name, "model", str(error))]
         if stored:
             found += compare_certificates(stored, new, name)

@@ -10,6 +10,8 @@ from typing import IO
 
 import numpy as np
 
+from flashdex.errors import is_of_machine
+
 MAX_BYTES = 4 << 30  # of what a file becomes; more is a mistake or an attack
 MAX_MEMBERS = 100_000
 # plain arrays hardly shrink further; small ones may, as masks of zeros do
@@ -50,9 +52,9 @@ def check_archive(file: Path | IO[bytes], *, limit: int = MAX_BYTES) -> None:
             check_sizes(archive, limit=limit)
             damaged = archive.testzip()
     # damaged bytes make zipfile and zlib raise nearly any exception
-    except (OSError, ValueError):
-        raise
     except Exception as error:
+        if isinstance(error, OSError | ValueError) or is_of_machine(error):
+            raise
         raise ValueError(f"not a whole archive ({error})") from error
     if damaged is not None:
         raise ValueError(f"its part {damaged!r} is damaged: the checksum differs")
@@ -74,9 +76,9 @@ def read_npz(path: Path, *, limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
                 raise ValueError(f"not an archive of arrays: {odd[:1] or names[:1]}")
             # reading to the end compares the checksum
             content = {n.removesuffix(".npy"): archive.read(n) for n in names}
-    except (OSError, ValueError):
-        raise
     except Exception as error:
+        if isinstance(error, OSError | ValueError) or is_of_machine(error):
+            raise
         raise ValueError(f"not a whole archive ({error})") from error
     arrays = {}
     for name, data in content.items():

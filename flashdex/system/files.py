@@ -214,7 +214,12 @@ def waiting_lock(path: Path) -> Iterator[None]:
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = path.with_name(f".{path.name}.lock")
-            held.enter_context(FileLock(lock, fallback_to_soft=False))
+            if fcntl is None:
+                held.enter_context(FileLock(lock, fallback_to_soft=False))
+            else:  # closing lets go, also where a disk refuses to be asked for it
+                handle = os.open(lock, os.O_RDWR | os.O_CREAT | _PLAIN, 0o666)
+                held.callback(os.close, handle)
+                fcntl.flock(handle, fcntl.LOCK_EX)
         yield
 
 

@@ -19,6 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from flashdex.errors import is_of_machine
 from flashdex.system.archives import MAX_BYTES, check_archive
 from flashdex.system.files import open_own, open_plain, own_file
 
@@ -38,9 +39,9 @@ def write_tensors(content: Any, root: Path, *parts: str) -> None:
         sink = _Sink(file)
         try:
             torch.save(content, sink)  # type: ignore[arg-type]
-        except RuntimeError:
+        except RuntimeError as error:
             # torch's writer makes a RuntimeError of its own of a failed write
-            raise sink.fault or OSError("the tensors cannot be written") from None
+            raise sink.fault or OSError(str(error).splitlines()[0]) from None
         _seal(file)
 
 
@@ -78,6 +79,7 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
         sealed: refuse one without a seal.
 
     Raises:
+        OSError, MemoryError: the machine fails, see ``is_of_machine``.
         ValueError: it is damaged, no file of tensors, or holds more than those.
         RunError: a link or something else stands there.
     """
@@ -91,10 +93,10 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
             check_archive(file)
             file.seek(0)
             content = torch.load(file, map_location="cpu", weights_only=True)
-    except ValueError:
-        raise
     # damaged bytes make torch raise nearly any exception
     except Exception as error:
+        if isinstance(error, ValueError) or is_of_machine(error):
+            raise
         words = str(error).strip() or type(error).__name__
         raise ValueError(words.splitlines()[0]) from error
     if isinstance(content, dict) and content.get("sealed") is True and not has_seal:

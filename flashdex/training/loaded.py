@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from flashdex import keys
 from flashdex.algorithms.base import Learner
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.motions.library import verify_library
 from flashdex.motions.library_format import MANIFEST
 from flashdex.recipe import Recipe, RunRecipe, expect_kind, parse_recipe
@@ -171,6 +171,8 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
             reader()
             files.append(name)
         except (FlashdexError, ValueError) as error:
+            if is_of_machine(error):
+                raise
             findings.append(Finding(name, "file", str(error)))
 
     for name, reader in readers.items():

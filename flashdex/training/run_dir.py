@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RecipeError, RunError
+from flashdex.errors import RecipeError, RunError, is_of_machine
 from flashdex.recipe import GymRecipe, RunRecipe, dump_recipe, load_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
@@ -305,6 +305,8 @@ def _load(learner: Learner, state: dict[str, Any], *, worlds_key: str) -> None:
     try:
         learner.load_state_dict(state)
     except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+        if is_of_machine(error):
+            raise
         # torch names every tensor that differs; the first one tells enough
         lines = [line.strip() for line in str(error).splitlines()]
         fault = " ".join(lines[:2])

@@ -12,7 +12,7 @@ import pytest
 from flashdex.datasets import list_recordings, register
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
-from flashdex.errors import DemoError
+from flashdex.errors import DemoError, UnknownSourceError
 from flashdex.motions.align import align
 from flashdex.motions.checks.aligned import check_left_out
 from flashdex.motions.contact.roles import find_roles
@@ -53,6 +53,18 @@ def stop():
 
 def wrong_key():
     return {}["no such key"]
+
+
+def test_what_killed_writers_left_in_the_cache_goes_after_a_day(settings, tmp_path):
+    folder = tmp_path / "cache" / "motions"
+    folder.mkdir(parents=True)
+    for name in (".a.npz.12.tmp", ".b.npz.12.tmp", "a.npz", "a.tmp"):
+        (folder / name).touch()
+        os.utime(folder / name, (0, 0))
+    (folder / ".b.npz.12.tmp").touch()  # somebody writes it now
+    with pytest.raises(UnknownSourceError):
+        run_order(Order("none such", settings=settings), tmp_path / "out")
+    assert sorted(os.listdir(folder)) == [".b.npz.12.tmp", "a.npz", "a.tmp"]
 
 
 @pytest.fixture

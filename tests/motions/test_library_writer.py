@@ -175,6 +175,13 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, record, name):
         write([record], tmp_path / name)
 
 
+def test_what_a_killed_writer_left_is_removed(copy, record):
+    for name in ("manifest.json", "report.html"):
+        (copy / f".{name}.123.tmp").write_text("torn")
+    write([record], copy)
+    assert not list(copy.glob(".*.tmp"))
+
+
 def test_only_data_of_libraries_is_removed(copy, record, tmp_path):
     for name in ("frames", "notes", "data-mine", "data-" + "0" * 15):
         thesis(copy / name)

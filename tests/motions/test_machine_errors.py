@@ -24,6 +24,9 @@ FAILURES = {
     "no_space": OSError(errno.ENOSPC, "No space left on device"),
     "too_many_files": OSError(errno.EMFILE, "Too many open files"),
     "stale_network_disk": OSError(errno.ESTALE, "Stale file handle"),
+    "torch": RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"),
+    "simulator": ValueError("Error: engine error: Could not allocate memory"),
+    "threads": RuntimeError("can't start new thread"),
     "not_allowed_yet": PermissionError(errno.EACCES, "Permission denied"),
 }
 machine = pytest.mark.parametrize("failure", FAILURES.values(), ids=FAILURES)
@@ -105,6 +108,7 @@ def test_an_object_is_not_made_of_one_hull_when_the_machine_fails(
         ValueError("content"),
         DemoError("refused"),
         MeshError("refused"),
+        RuntimeError("shapes differ"),
     ],
     ids=repr,
 )

@@ -1,9 +1,11 @@
 """Archives from outside: bounded before they are unpacked, checked, never unpickled."""
 
+import errno
 import io
 import os
 import pickle
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
@@ -55,6 +57,21 @@ def test_every_flipped_bit_of_the_content_is_found(tmp_path):
             read_npz(path)
         with pytest.raises(ValueError, match="checksum differs"):
             check_archive(path)
+
+
+MACHINE = (MemoryError(), OSError(errno.EIO, "failed"), zlib.error("Error -4 while"))
+
+
+@pytest.mark.parametrize("failure", MACHINE, ids=lambda f: type(f).__name__)
+@pytest.mark.parametrize("read", [check_archive, read_npz])
+def test_a_machine_that_fails_is_no_damage(tmp_path, monkeypatch, read, failure):
+    def fail(*_):
+        raise failure
+
+    np.savez_compressed(tmp_path / "a.npz", values=np.arange(5))
+    monkeypatch.setattr(zipfile.ZipExtFile, "read", fail)
+    with pytest.raises(type(failure)):
+        read(tmp_path / "a.npz")
 
 
 class Harm:

@@ -1,5 +1,6 @@
 """Atomic writes: the whole new file or the old one, and nothing beside it."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -99,6 +100,21 @@ def test_a_second_process_waits_for_what_is_being_made(hold, tmp_path):
         os.set_blocking(second.stdout.fileno(), True)
         assert second.stdout.readline() == "held\n"
         second.kill()
+
+
+def test_a_disk_that_refuses_to_unlock_keeps_nobody_out(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    real = fcntl.flock
+
+    def refuse(handle, how):
+        if how == fcntl.LOCK_UN:
+            raise OSError(errno.EIO, "Input/output error")
+        real(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    for _ in range(2):
+        with waiting_lock(tmp_path / "asset"):
+            pass
 
 
 def test_a_folder_that_cannot_be_made_is_worked_in_without_a_lock(tmp_path):

@@ -28,6 +28,7 @@ from hostile import (
 
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import dump_recipe
+from flashdex.replay import disk as disk_module
 from flashdex.system.files import run_lock
 from flashdex.system.jsonl import read_lines, read_object
 from flashdex.system.run_files import (
@@ -221,16 +222,22 @@ def results():
     return {}
 
 
-def check_spoilt(folder, name, spoil, gym_run, use, results, verb):
+def expect(verb, folder, gym_run, use, results):
+    """What a verb makes of the run as it is, found out once."""
     if verb not in results:
         other = shutil.copytree(gym_run, folder.parent / "other")
         found = use(verb, other)
         assert found.code == 0
         results[verb] = resumed(other) if verb == "train" else found.out
+    return results[verb]
+
+
+def check_spoilt(folder, name, spoil, gym_run, use, results, verb):
+    whole = expect(verb, folder, gym_run, use, results)
     shutil.rmtree(folder)
     shutil.copytree(gym_run, folder)
     spoil(folder / name, drawn(name))
-    judge(verb, folder, use(verb, folder), results[verb])
+    judge(verb, folder, use(verb, folder), whole)
 
 
 TEXT = ("recipe.yaml", "versions.json", METRICS, "sessions.jsonl")
@@ -302,6 +309,44 @@ def test_what_is_not_finite_gives_way_to_the_one_before(spoil, run_dir, use):
     assert "is not finite" in found.told
     assert first_non_finite(load_checkpoint(run_dir)["learner"]) == ""
     assert path.with_suffix(".unreadable").exists()
+
+
+MACHINE = {
+    "disk": OSError(errno.EIO, "Input/output error"),
+    "memory": MemoryError(),
+    "torch": RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"),
+    "threads": RuntimeError("can't start new thread"),
+}
+
+
+PLACES = {
+    "checkpoint": (torch, "load"),
+    "rows": (disk_module, "read_tensors"),
+    "loop": (Trainer, "vector_step"),
+}
+FAILS = [("checkpoint", name) for name in MACHINE]
+FAILS += [("rows", "disk"), ("rows", "torch"), ("loop", "torch")]
+
+
+@pytest.mark.parametrize(("place", "failure"), FAILS)
+def test_a_machine_that_fails_says_nothing_of_the_files(
+    place, failure, run_dir, gym_run, use, monkeypatch, results
+):
+    left, real = [MACHINE[failure]], getattr(*PLACES[place])
+
+    def fail_once(*args, **kwargs):
+        if left:
+            raise left.pop()
+        return real(*args, **kwargs)
+
+    whole = expect("train", run_dir, gym_run, use, results)
+    before = fingerprint(run_dir / CHECKPOINTS)
+    with monkeypatch.context() as patch:
+        patch.setattr(*PLACES[place], fail_once)
+        assert use("train", run_dir).is_one_message("train")
+    assert fingerprint(run_dir / CHECKPOINTS) == before
+    assert use("train", run_dir).code == 0
+    assert resumed(run_dir) == whole
 
 
 @pytest.mark.parametrize(

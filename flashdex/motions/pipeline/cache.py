@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import time
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +33,7 @@ logger = logging.getLogger(__name__)
 CODE = ("motions", "hands", "geometry", "keys.py")
 CODE_SUFFIXES = (".py", ".xml")
 LIBRARIES = ("numpy", "scipy", "torch", "mujoco", "trimesh", "coacd")
+DAY = 86_400.0  # s; nobody writes one file for so long
 
 
 def content_hash(recording: Recording) -> str:
@@ -67,6 +70,14 @@ def _code_hash() -> str:
                 digest.update(file.read_bytes())
     digest.update(" ".join(version(name) for name in LIBRARIES).encode())
     return digest.hexdigest()
+
+
+def remove_torn(root: Path) -> None:
+    """Delete what writers that were killed, a day ago or earlier, left in a cache."""
+    with suppress(OSError):  # a cache that cannot be written is left as it is
+        for file in root.glob("*/.*.npz.*.tmp"):
+            if time.time() - file.lstat().st_mtime > DAY:
+                file.unlink()
 
 
 def write_prepared(file: Path, prepared: list[Prepared]) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from flashdex.datasets.demo import MAX_SECONDS, HumanDemo
 from flashdex.datasets.source import Recording
-from flashdex.errors import DemoError, MeshError
+from flashdex.errors import DemoError, MeshError, is_of_machine
 from flashdex.hands.spec import load_hand
 from flashdex.keys import SIDES
 from flashdex.motions.align import align
@@ -139,7 +139,8 @@ def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
     except Exception as error:  # what no check foresaw must not end the others
         logger.debug("%s", name, exc_info=True)
         item = rejected(name, [of_error(error)])
-        return [replace(item, passing=isinstance(error, OSError | MemoryError))]
+        passing = isinstance(error, OSError) or is_of_machine(error)
+        return [replace(item, passing=passing)]
 
 
 def rejected(name: str, findings: list[Finding]) -> Prepared:

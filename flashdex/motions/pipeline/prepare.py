@@ -26,7 +26,7 @@ from flashdex.motions.library_writer import (
     MotionRecord,
     check_target,
 )
-from flashdex.motions.pipeline.cache import cache_file, content_hash
+from flashdex.motions.pipeline.cache import cache_file, content_hash, remove_torn
 from flashdex.motions.pipeline.motion import MotionSettings, rejected
 from flashdex.motions.pipeline.workers import Job, Outcome, run_jobs
 from flashdex.system.names import file_stem, plain_name
@@ -81,6 +81,7 @@ def run_order(
     # refused before anything is read
     load_hand(settings.hand)
     check_target(Path(out))
+    remove_torn(settings.cache_root)
     listed = order.recordings()
     recordings, doubles = _without_doubles(listed)
     jobs = [Job(recording, settings) for recording in recordings]

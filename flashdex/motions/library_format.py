@@ -100,6 +100,11 @@ class Manifest:
     meshes: dict[str, str]  # path below ``data`` to SHA-256
     sha256: str  # of all it says, and so of all the library holds
 
+    @property
+    def seed(self) -> int:
+        """Of what is drawn to check the library; the same for the same content."""
+        return int(self.sha256[:15], 16)
+
     def names(self, part: Literal["motions", "objects"]) -> list[str]:
         """Names of the motions or objects, in row order."""
         return [row["name"] for row in self.entries[part]]

@@ -80,13 +80,20 @@ def read_mesh(path: Path, data: str, name: str, sha256: str) -> Mesh:
 
 
 def _parse_obj(text: str) -> Mesh:
-    lines = [line.split() for line in text.splitlines()]
-    points = [words[1:4] for words in lines if words[:1] == ["v"]]
-    corners = [words[1:4] for words in lines if words[:1] == ["f"]]
-    vertices = np.array(points, np.float32).reshape(-1, 3)
-    faces = np.array(corners, np.int64).reshape(-1, 3) - 1
+    lines = text.splitlines()
+    vertices, faces = (
+        np.array(_words(lines, kind), number).reshape(-1, 3)
+        for kind, number in (("v ", np.float32), ("f ", np.int64))
+    )
+    faces -= 1
     if not np.isfinite(vertices).all() or len(vertices) < 4 or len(faces) < 1:
         raise ValueError("it has no body, or numbers that are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a triangle names a vertex that is not there")
     return vertices, faces
+
+
+def _words(lines: list[str], kind: str) -> list[float] | list[int]:
+    # one split of all lines of a kind: a library holds a million of them
+    words = " ".join([line[2:] for line in lines if line.startswith(kind)]).split()
+    return list(map(float if kind == "v " else int, words))

@@ -6,26 +6,35 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library_format import ARRAYS, FRAME_KEYS, OBJECT_KEYS, Manifest
+from flashdex.motions.library_meshes import Mesh
+from flashdex.motions.velocities import find_other_velocities
+from flashdex.objects.bodies import MASS, MAX_SIZE
+from flashdex.objects.signed_distance import triangle_distance, winding_number
 
 Arrays = Mapping[str, np.ndarray]
 ROWS = 16_384  # checked at a time: the check of a large array needs little memory
 # Smallest and largest value of each array; generous, what is beyond is no motion.
-# m and rad: 100; m/s and rad/s: 10,000. NaN and infinity are in no range.
+# m and rad: 100; m/s: 50, rad/s: 200, as joints of both kinds have. NaN and infinity
+# are in no range.
 LIMITS = {
     **{name: (-100.0, 100.0) for name, (dtype, _) in ARRAYS.items() if "32" in dtype},
-    **{f"frames/{k}": (-1e4, 1e4) for k in FRAME_KEYS if k.endswith("vel")},
+    **{f"frames/{k}": (-200.0, 200.0) for k in FRAME_KEYS if k.endswith("vel")},
+    **{f"frames/{k}": (-50.0, 50.0) for k in FRAME_KEYS if k.endswith("linvel")},
     "frames/tip_dist": (0.0, 100.0),
     "objects/normals": (-1.001, 1.001),
     "objects/radius": (1e-5, 100.0),
     "objects/sdf_spacing": (1e-6, 10.0),
-    "objects/mass": (1e-6, 1000.0),
+    "objects/mass": MASS,
 }
 del LIMITS["motions/support_disks"]
 QUAT_SLACK = 1e-3  # of a norm from 1
 BOX_SLACK = 0.1  # of a box's longest side, that a mesh and its parts may differ by
+SURFACE_SLACK = 0.02  # of the same, by which a distance grid may miss the surface
+NUM_NODES = 4  # of a distance grid that are compared with the mesh, inside and any
 MAX_VERTICES = 10_000  # of a convex part; a hull of more takes for ever
 MIN_THICKNESS = 1e-6  # m; the simulation knows no flat bodies
 MIN_INERTIA = 1e-12  # kg m2; MuJoCo takes less than 1e-14 for none
@@ -40,6 +49,7 @@ def find_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
     yield from _motion_faults(manifest, arrays)
     names = manifest.names("motions")
     starts = arrays["motions/start"]
+    has_fault = False
     for name, array in arrays.items():
         per_object = manifest.names("objects") if name.startswith("objects/") else None
         row = None
@@ -51,12 +61,24 @@ def find_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
             row = _first(array, _no_rotation)
         if row is not None:
             where = _where(row, per_object, names, starts)
+            has_fault = has_fault or name.startswith("frames/")
             yield f"{name}: {_values(array[row])} {where}"
+    if not has_fault:
+        yield from _velocity_faults(manifest, arrays)
     for row, name in enumerate(manifest.names("objects")):
         for fault in _body_faults(
             {k: arrays[f"objects/{k}"][row] for k in OBJECT_KEYS}
         ):
             yield f"object {name!a}: {fault}"
+
+
+def _velocity_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
+    fps = float(manifest.entries["fps"])
+    names, starts = manifest.names("motions"), arrays["motions/start"]
+    found = find_other_velocities(arrays, fps, manifest.seed)
+    for name, row, told, wanted in found:
+        where = _where(row, None, names, starts)
+        yield f"{name}: holds {told:.4g}, the positions say {wanted:.4g} {where}"
 
 
 def _first(array: np.ndarray, is_bad: Any) -> int | None:
@@ -133,8 +155,8 @@ def _body_faults(body: Mapping[str, np.ndarray]) -> Iterator[str]:
     inertia, mass = body["inertia"].astype(np.float64), float(body["mass"])
     if not np.isfinite(inertia).all():
         return  # that it is not was told
-    if not (size > 0).all():
-        yield "its box has no inside"
+    if not (size > 0).all() or size.max() > 2 * MAX_SIZE:
+        yield f"its box is {' x '.join(f'{s:.3g}' for s in size)} m, which no object is"
     slack = BOX_SLACK * size.max() + 1e-3
     points = body["points"]
     if ((points < low - slack) | (points > high + slack)).any():
@@ -176,4 +198,51 @@ def part_fault(vertices: np.ndarray, box: np.ndarray) -> str:
         MIN_THICKNESS
     ):
         return "is flat"
+    return ""
+
+
+def grid_fault(body: Mapping[str, np.ndarray], mesh: Mesh, seed: int) -> str:
+    """Why a distance grid is not that of a mesh; empty where it is.
+
+    The surface points lie at distance zero, no two neighbours differ by more than their
+    distance, and some nodes are compared with the mesh, of which others made the grid.
+
+    Args:
+        body: arrays of one object, by name.
+        mesh: visual mesh of the object, m.
+        seed: of the nodes; not to be known to whoever made the grid.
+    """
+    grid, spacing = body["sdf"], float(body["sdf_spacing"])
+    low, high = body["aabb"].astype(np.float64)
+    side, resolution = float((high - low).max()), len(grid)
+    nodes = (body["points"] - body["sdf_origin"]) / spacing
+    off = np.abs(map_coordinates(grid, nodes.T, order=1, mode="nearest")).max()
+    if not off <= spacing + SURFACE_SLACK * side:
+        return f"its distance grid is {off:.4g} m at its surface"
+    far = np.abs(grid)
+    for axis in range(3):
+        step = np.diff(far, axis=axis)
+        if max(step.max(), -step.min()) > 1.5 * spacing:
+            return "its distance grid leaps between neighbouring nodes"
+    draw = np.random.default_rng(seed)
+    inside = np.flatnonzero(grid < 0)
+    chosen = [draw.integers(grid.size, size=NUM_NODES)]
+    if len(inside):
+        chosen.append(draw.choice(inside, NUM_NODES))
+    index = np.concatenate(chosen)
+    places = np.stack(np.unravel_index(index, grid.shape), axis=-1) * spacing
+    told = grid.ravel()[index].astype(np.float64)
+    vertices, faces = mesh
+    triangles = vertices.astype(np.float64)[faces]
+    places += body["sdf_origin"]
+    distance = triangle_distance(triangles, places)
+    winding = winding_number(triangles, places)
+    signed = np.where(winding > 0.5, -distance, distance)
+    # near the hole of an open mesh nobody knows which side it is
+    is_sure = np.abs(winding - 0.5) > 0.25
+    gaps = np.where(is_sure, np.abs(told - signed), np.abs(np.abs(told) - distance))
+    worst = int(gaps.argmax())
+    if not gaps[worst] <= spacing + BOX_SLACK * side:
+        text = f"its distance grid holds {told[worst]:.4g} m where its mesh is "
+        return f"{text}{signed[worst]:.4g} m away"
     return ""

@@ -281,9 +281,9 @@ def hash_json(value: Any) -> str:
 
 
 @contextmanager
-def as_library_error() -> Iterator[None]:
+def as_library_error(hint: str = AGAIN) -> Iterator[None]:
     """A library's files are a run's files but for the error."""
     try:
         yield
     except RunError as error:
-        raise LibraryError(f"{error} {AGAIN}") from error
+        raise LibraryError(f"{error} {hint}".strip()) from error

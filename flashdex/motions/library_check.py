@@ -27,7 +27,12 @@ from flashdex.motions.library_format import (
     is_hash,
 )
 from flashdex.motions.library_meshes import Mesh, read_mesh
-from flashdex.motions.library_numbers import find_faults, grid_fault, part_fault
+from flashdex.motions.library_numbers import (
+    find_faults,
+    grid_fault,
+    part_fault,
+    parts_fault,
+)
 from flashdex.objects.asset import default_cache_dir
 from flashdex.system.arrays import hash_content, map_array
 from flashdex.system.files import own_file
@@ -55,10 +60,12 @@ def _changes(path: Path, manifest: Manifest, arrays: Arrays) -> Iterator[str]:
         for file in entry["parts"]:
             if file in bodies and (fault := part_fault(bodies[file][0], body["aabb"])):
                 yield f"{file}: {fault}"
-        if (mesh := bodies.get(entry["visual"])) and (
-            fault := grid_fault(body, mesh, manifest.seed + row)
-        ):
-            yield f"object {entry['name']!a}: {fault}"
+        if all(file in bodies for file in (*entry["parts"], entry["visual"])):
+            parts = [bodies[file][0] for file in entry["parts"]]
+            fault = parts_fault(parts, body["aabb"])
+            mesh = bodies[entry["visual"]]
+            if fault := fault or grid_fault(body, mesh, manifest.seed + row):
+                yield f"object {entry['name']!a}: {fault}"
     if len(bodies) == len(manifest.meshes):
         yield from _exchanged(manifest, arrays)
 

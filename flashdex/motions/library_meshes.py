@@ -16,7 +16,8 @@ from flashdex.objects.asset import ObjectAsset
 from flashdex.system.files import open_plain, own_file
 from flashdex.system.names import file_stem
 
-MAX_MESH = 64 << 20  # bytes; a visual mesh has 5,000 triangles
+MAX_MESH = 64 << 20  # bytes
+MAX_FACES = 20_000  # a visual mesh has 5,000, a convex part twice its vertices
 Mesh = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
@@ -74,13 +75,15 @@ def read_mesh(path: Path, data: str, name: str, sha256: str) -> Mesh:
             return _parse_obj(text.decode("ascii"))
     except FileNotFoundError:
         fault = "is missing"
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         fault = f"cannot be read ({error})"
     raise LibraryError(f"{file}: {fault}. {AGAIN}")
 
 
 def _parse_obj(text: str) -> Mesh:
     lines = text.splitlines()
+    if (count := sum(line.startswith("f ") for line in lines)) > MAX_FACES:
+        raise ValueError(f"it has {count} triangles, {MAX_FACES} are allowed")
     vertices, faces = (
         np.array(_words(lines, kind), number).reshape(-1, 3)
         for kind, number in (("v ", np.float32), ("f ", np.int64))

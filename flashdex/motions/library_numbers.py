@@ -24,15 +24,16 @@ LIMITS = {
     **{name: (-100.0, 100.0) for name, (dtype, _) in ARRAYS.items() if "32" in dtype},
     **{f"frames/{k}": (-200.0, 200.0) for k in FRAME_KEYS if k.endswith("vel")},
     **{f"frames/{k}": (-50.0, 50.0) for k in FRAME_KEYS if k.endswith("linvel")},
-    "frames/tip_dist": (0.0, 100.0),
+    "frames/tip_dist": (0.0, 10.0),  # which stands for no object
     "objects/normals": (-1.001, 1.001),
     "objects/radius": (1e-5, 100.0),
     "objects/sdf_spacing": (1e-6, 10.0),
     "objects/mass": MASS,
 }
 del LIMITS["motions/support_disks"]
-QUAT_SLACK = 1e-3  # of a norm from 1
+UNIT_SLACK = 1e-3  # of a norm from 1
 BOX_SLACK = 0.1  # of a box's longest side, that a mesh and its parts may differ by
+PARTS_SLACK = 0.2  # of the same, that a decomposition may leave out on one side
 SURFACE_SLACK = 0.02  # of the same, by which a distance grid may miss the surface
 NUM_NODES = 3  # of a distance grid, compared with the mesh; twice as many in its box
 MAX_VERTICES = 10_000  # of a convex part; a hull of more takes for ever
@@ -100,7 +101,7 @@ def _outside(values: np.ndarray, low: float, high: float) -> np.ndarray | None:
 
 def _no_rotation(quat: np.ndarray) -> np.ndarray:
     norm = np.sqrt(np.square(quat, dtype=np.float64).sum(-1))
-    return (np.abs(norm - 1) > QUAT_SLACK).reshape(len(quat), -1).any(-1)
+    return (np.abs(norm - 1) > UNIT_SLACK).reshape(len(quat), -1).any(-1)
 
 
 def _values(row: np.ndarray) -> str:
@@ -181,6 +182,16 @@ def _body_faults(body: Mapping[str, np.ndarray]) -> Iterator[str]:
         yield f"its inertia is larger than {mass:.4g} kg in its box can have"
 
 
+def parts_fault(parts: list[np.ndarray], box: np.ndarray) -> str:
+    """Why convex parts, m, (V, 3) each, are not those of an object with this box."""
+    low = np.min([part.min(0) for part in parts], axis=0)
+    high = np.max([part.max(0) for part in parts], axis=0)
+    gap = float(np.maximum(low - box[0], box[1] - high).max())
+    if gap > PARTS_SLACK * float((box[1] - box[0]).max()) + 0.002:
+        return f"its convex parts end {gap:.3g} m before its box does"
+    return ""
+
+
 def part_fault(vertices: np.ndarray, box: np.ndarray) -> str:
     """Why a convex part of an object cannot be simulated; empty where it can.
 
@@ -204,8 +215,9 @@ def part_fault(vertices: np.ndarray, box: np.ndarray) -> str:
 def grid_fault(body: Mapping[str, np.ndarray], mesh: Mesh, seed: int) -> str:
     """Why a distance grid is not that of a mesh; empty where it is.
 
-    The surface points lie at distance zero, no two neighbours differ by more than their
-    distance, and some nodes are compared with the mesh, of which others made the grid.
+    The surface points lie at distance zero, their normals lead outward, no two
+    neighbours differ by more than their distance, and some nodes are compared with the
+    mesh, of which others made the grid.
 
     Args:
         body: arrays of one object, by name.
@@ -215,8 +227,17 @@ def grid_fault(body: Mapping[str, np.ndarray], mesh: Mesh, seed: int) -> str:
     grid, spacing = body["sdf"], float(body["sdf_spacing"])
     low, high = body["aabb"].astype(np.float64)
     side = float((high - low).max())
-    nodes = (body["points"] - body["sdf_origin"]) / spacing
-    off = np.abs(map_coordinates(grid, nodes.T, order=1, mode="nearest")).max()
+    nodes, normals = (body["points"] - body["sdf_origin"]) / spacing, body["normals"]
+    below, at, above = (
+        map_coordinates(grid, (nodes + step * normals).T, order=1, mode="nearest")
+        for step in (-1, 0, 1)
+    )
+    if np.abs(np.linalg.norm(normals, axis=-1) - 1).max() > UNIT_SLACK or (
+        # of an open mesh both sides are the same
+        (above - below).mean() < -spacing / 4
+    ):
+        return "its normals are not of length one, or point inward"
+    off = np.abs(at).max()
     if not off <= spacing + SURFACE_SLACK * side:
         return f"its distance grid is {off:.4g} m at its surface"
     far = np.abs(grid)

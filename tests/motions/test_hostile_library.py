@@ -166,6 +166,10 @@ NUMBERS = {
     "slot-not-there": put("motions/hand_object", (0, 1), 2),
     "slot-below": put("motions/hand_object", (0, 1), -2),
     "slot-empty": put("motions/hand_object", (0, 1), 1),
+    "no-object": lambda e, a: [
+        a[f"motions/{key}"].__setitem__(0, -1)
+        for key in ("object_index", "hand_object")
+    ],
     "no-hand": put("motions/hand_active", 0, False),
     "disc-partly-nan": put("motions/support_disks", (0, 0, 2), np.nan),
     "disc-of-no-radius": put("motions/support_disks", (0, 0, 3), 0.0),

@@ -191,6 +191,16 @@ def forge_library(path, edit):
     (path / "manifest.json").write_text(json.dumps(entries))
 
 
+def renew_velocities(arrays):
+    """Make the velocities follow from the positions again."""
+    rows = zip(arrays["motions/start"], arrays["motions/length"], strict=True)
+    for start, length in rows:
+        span = slice(start, start + length)
+        frames = {n[7:]: a[span] for n, a in arrays.items() if n.startswith("frames/")}
+        for key, speed in derive_velocities(frames, FPS).items():
+            arrays[f"frames/{key}"][span] = speed
+
+
 def data_of(path):
     """Folder of the arrays and meshes of a library."""
     return path / read_manifest(path).data

@@ -138,8 +138,8 @@ def _motion_faults(manifest: Manifest, arrays: Arrays) -> Iterator[str]:
     held = np.take_along_axis(index, slot.clip(0), 1) < 0
     for row in np.flatnonzero((held & (slot >= 0)).any(1)):
         yield f"motions/hand_object: motion {row} holds an empty slot"
-    for row in np.flatnonzero((index < 0).all(1)):
-        yield f"motions/object_index: motion {row} has no object"
+    if (index < 0).all():
+        yield "motions/object_index: no motion has an object"
     for row in np.flatnonzero(~arrays["motions/hand_active"].any(1)):
         yield f"motions/hand_active: motion {row} has no hand"
     discs = arrays["motions/support_disks"]

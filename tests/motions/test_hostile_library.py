@@ -167,8 +167,7 @@ NUMBERS = {
     "slot-below": put("motions/hand_object", (0, 1), -2),
     "slot-empty": put("motions/hand_object", (0, 1), 1),
     "no-object": lambda e, a: [
-        a[f"motions/{key}"].__setitem__(0, -1)
-        for key in ("object_index", "hand_object")
+        a[f"motions/{key}"].fill(-1) for key in ("object_index", "hand_object")
     ],
     "no-hand": put("motions/hand_active", 0, False),
     "disc-partly-nan": put("motions/support_disks", (0, 0, 2), np.nan),

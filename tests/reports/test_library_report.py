@@ -2,7 +2,6 @@
 
 import base64
 import csv
-import dataclasses
 import io
 import re
 import shutil
@@ -438,16 +437,11 @@ def test_pictures_show_objects_and_hands(mine, backend):
             assert (grey & (red < 140)).sum() > 300  # the hand
 
 
-def test_a_motion_that_cannot_be_drawn_does_not_spoil_the_others(
-    hands, tmp_path, backend
-):
-    def flatten(record):  # a surface that MuJoCo takes for no mesh
-        shape = {"visual_vertices": np.zeros((4, 3), np.float32)}
-        shape["visual_faces"] = np.array([[0, 1, 2]], np.int32)
-        record.objects = [dataclasses.replace(record.objects[0], sha256="f", **shape)]
-
-    library = write_library(tmp_path / "a", hands, changes={"right_box": [flatten]})
-    drawn, fault = draw_thumbnails(library, [0, 1])
+def test_a_motion_that_cannot_be_drawn_does_not_spoil_the_others(plain, backend):
+    file = plain.manifest["objects"][0]["visual"]
+    # a surface that MuJoCo takes for no mesh; no library is written with one
+    plain._meshes[file] = np.zeros((4, 3), np.float32), np.array([[0, 1, 2]])
+    drawn, fault = draw_thumbnails(plain, [0, 1])
     assert list(drawn) == [1]
     assert fault.startswith("no pictures of 1 of 2 motions: right_box: ")
 

@@ -19,6 +19,7 @@ from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_check import hash_rows
 from flashdex.motions.library_format import read_manifest
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectAsset
 from flashdex.system.arrays import hash_content, write_array
 
@@ -81,49 +82,32 @@ def make_frames(hands, length, active, owner, objects):
     kinematics = HandKinematics(hands)
     tips = kinematics(torch.as_tensor(joints).float(), None)["tip_pos"].double()
     joints[..., :3] = centre + np.array([0, 0, 0.008]) - tips.mean(2).numpy()
-    vel = np.gradient(joints, 1 / FPS, axis=0)
-    kin = kinematics(torch.as_tensor(joints).float(), torch.as_tensor(vel).float())
-    keypoints, keypoint_vel = human_hand(hands, kin, time)
+    kin = kinematics(torch.as_tensor(joints).float(), None)
+    keypoints = human_hand(hands, kin, time)
     distance = np.linalg.norm(
         keypoints[:, :, [4, 8, 12, 16, 20]] - centre[:, :, None], axis=-1
     )
-    return {
+    frames = {
         "joint_pos": joints,
-        "joint_vel": vel,
         "wrist_pos": keypoints[:, :, 0],
         "wrist_quat": kin["wrist_quat"].double().numpy(),
-        "wrist_linvel": keypoint_vel[:, :, 0],
-        "wrist_angvel": kin["wrist_angvel"].double().numpy(),
         "keypoints": keypoints,
-        "keypoint_linvel": keypoint_vel,
         "tip_dist": np.clip(distance - 0.02, 0.0, None),
         "object_pos": pos,
         "object_quat": quat,
-        "object_linvel": np.gradient(pos, 1 / FPS, axis=0),
-        "object_angvel": spin_of(quat),
     }
+    return frames | derive_velocities(frames, FPS)
 
 
 def human_hand(hands, kin, time):
-    """Keypoints near the robot's links, a few millimetres off, and their velocities."""
+    """Keypoints near the robot's links, a few millimetres off."""
     points = kin["wrist_pos"].double().numpy()[:, :, None].repeat(21, 2)
     for side, name in enumerate(("left", "right")):
         for link, keypoint in hands[name].keypoint_links:
             points[:, side, keypoint] = kin["link_pos"][:, side, link].double().numpy()
     points[:, :, [4, 8, 12, 16, 20]] = kin["tip_pos"].double().numpy()
     offset = 0.004 * np.sin(np.arange(21) + 5 * time[:, None])
-    points = points + offset[:, None, :, None] * np.array([1.0, -0.5, 0.3])
-    return points, np.gradient(points, 1 / FPS, axis=0)
-
-
-def spin_of(quat):
-    """World angular velocity by central differences, (T, O, 3)."""
-    turns = [Rotation.from_quat(quat[:, s][:, [1, 2, 3, 0]]) for s in range(2)]
-    out = np.zeros((len(quat), 2, 3))
-    for slot, turn in enumerate(turns):
-        step = (turn[2:] * turn[:-2].inv()).as_rotvec() * FPS / 2
-        out[1:-1, slot] = step
-    return out
+    return points + offset[:, None, :, None] * np.array([1.0, -0.5, 0.3])
 
 
 def make_box():
@@ -205,6 +189,16 @@ def forge_library(path, edit):
             for row, digest in zip(entries[part], found, strict=True):
                 row["content_sha256"] = digest
     (path / "manifest.json").write_text(json.dumps(entries))
+
+
+def renew_velocities(arrays):
+    """Make the velocities follow from the positions again."""
+    rows = zip(arrays["motions/start"], arrays["motions/length"], strict=True)
+    for start, length in rows:
+        span = slice(start, start + length)
+        frames = {n[7:]: a[span] for n, a in arrays.items() if n.startswith("frames/")}
+        for key, speed in derive_velocities(frames, FPS).items():
+            arrays[f"frames/{key}"][span] = speed
 
 
 def data_of(path):

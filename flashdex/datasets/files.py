@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import pickle
 import re
 import zipfile
@@ -17,9 +16,8 @@ from typing import IO, Any
 import numpy as np
 
 from flashdex.datasets.pickles import MAX_BYTES, RefusedError, unpickle
-from flashdex.datasets.pickles import check_sizes as check_shape
 from flashdex.errors import DemoError, is_of_machine
-from flashdex.system.archives import check_sizes
+from flashdex.system.archives import check_sizes, read_array
 
 POINTER_START = b"version https://git-lfs"
 MAX_TEXT = 256 << 20  # bytes of a text file
@@ -123,7 +121,9 @@ def load_pickle(path: Path) -> Any:
 
 def load_npy(path: Path) -> Any:
     """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _open(path, ".npy array", lambda file: _read_array(file.read()))
+    return _open(
+        path, ".npy array", lambda file: read_array(file.read(), unpickle=unpickle)
+    )
 
 
 def load_npz(
@@ -179,28 +179,6 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
         ) from error
 
 
-def _read_array(data: bytes) -> Any:
-    file = io.BytesIO(data)
-    version = "_".join(map(str, np.lib.format.read_magic(file)))
-    read_header = getattr(np.lib.format, f"read_array_header_{version}")
-    try:
-        shape, by_columns, dtype = read_header(file)
-    except MemoryError:  # Python's parser says so of text that is too deep for it
-        raise ValueError("its header is nested too deep") from None
-    if dtype.kind == "O":
-        array = unpickle(file)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
-            raise ValueError("an object array that holds something else")
-        return array.item() if array.ndim == 0 else array
-    count = math.prod(check_shape(shape))
-    if dtype.hasobject or count * dtype.itemsize > len(data):
-        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
-    raw = bytearray(file.read(count * dtype.itemsize))
-    return np.frombuffer(raw, dtype, count).reshape(
-        shape, order="F" if by_columns else "C"
-    )
-
-
 def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
     with zipfile.ZipFile(file) as archive:
         check_sizes(archive, limit=MAX_BYTES)
@@ -209,7 +187,10 @@ def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
             raise ValueError("it holds no .npy entries")
         names = {name.removesuffix(".npy"): name for name in files}
         wanted = {k: v for k, v in names.items() if only is None or k in only}
-        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
+        return {
+            key: read_array(archive.read(name), unpickle=unpickle)
+            for key, name in wanted.items()
+        }
 
 
 def _read_torch(file: IO[bytes]) -> Any:

@@ -4,7 +4,8 @@ Licensed datasets come as pickles, object arrays and torch files (see ``files``)
 pickle may name stands in ``ALLOWED``; every other name is refused and told. What it
 names is a stand-in that only keeps what it is given; plain values are made of it
 afterwards, from checked sizes and indices. So no name can be called to an effect, and
-no class of a library is within reach. Nothing becomes more than 2 GiB.
+no class of a library is within reach. What a file becomes is bounded by its size,
+before memory is taken for it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pickle
 import pickletools
 import re
 import struct
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import IO, Any
@@ -22,7 +24,19 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
-MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
+MAX_BYTES = 2 << 30  # of a file, and of what it becomes
+# What a file may become: a small one anything up to LEAST_ROOM, a larger one GROWTH
+# times its size up to MOST_GROWN; beyond that, twice its size.
+LEAST_ROOM, GROWTH, MOST_GROWN = 64 << 20, 32, 512 << 20
+# bytes that a step of the pickle machine takes at least, and an item of a set or table
+STEP, HASHED = 32, 48
+STEPS = {
+    **dict.fromkeys(("REDUCE", "NEWOBJ", "NEWOBJ_EX", "OBJ", "INST"), 200),
+    **dict.fromkeys(("EMPTY_SET", "FROZENSET"), 216),
+    **dict.fromkeys(("EMPTY_DICT", "DICT", "EMPTY_LIST", "LIST", "TUPLE"), 64),
+    **dict.fromkeys(("MARK", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE", "GET"), 8),
+    **dict.fromkeys(("BINGET", "LONG_BINGET", "DUP", "POP", "APPEND", "APPENDS"), 8),
+}
 MAX_STEPS = 20_000_000  # of the pickle machine, some seconds
 MAX_INT = 2**64  # of a number that is no magic
 MAX_HASHED = 200_000_000  # parts of keys, some seconds
@@ -78,18 +92,19 @@ class StandIn:
         self.state.append((key, item))
 
     @staticmethod
-    def make(args: tuple, state: Any) -> Any:
-        """The value, of plain arguments and a plain state."""
+    def make(args: tuple, state: Any, room: int) -> Any:
+        """The value, of plain arguments and a plain state, in ``room`` bytes."""
         raise ValueError("a bare class is not data")
 
 
-def _stand_in(make: Callable[[tuple, Any], Any]) -> type[StandIn]:
+def _stand_in(make: Callable[[tuple, Any, int], Any]) -> type[StandIn]:
     return type("StandIn", (StandIn,), {"make": staticmethod(make)})
 
 
-def _encoded(args: tuple, state: Any) -> bytes:
+def _encoded(args: tuple, state: Any, room: int) -> bytes:
     if args[1] not in ("latin1", "latin-1"):
         raise ValueError(f"bytes in the encoding {args[1]!r}")
+    _check_room(len(args[0]), room)
     return args[0].encode("latin1")
 
 
@@ -97,15 +112,15 @@ def _bytes(data: Any) -> Any:
     return data.encode("latin1") if isinstance(data, str) else data
 
 
-def _old_object(args: tuple, state: Any) -> Any:
+def _old_object(args: tuple, state: Any, room: int) -> Any:
     """``copyreg._reconstructor``: an object of an old pickle."""
     kind, base, content = args
     if not issubclass(kind, StandIn) or base is not OBJECT or content is not None:
         raise ValueError("an old-style object that is not plain")
-    return kind.make((), state)
+    return kind.make((), state, room)
 
 
-def _dtype(args: tuple, state: Any) -> np.dtype:
+def _dtype(args: tuple, state: Any, room: int) -> np.dtype:
     """Numbers, texts or objects; the state is (version, byte order, no parts, ...)."""
     state = state or (3, "|", None, None, None)
     if not isinstance(args[0], str) or not DTYPE_CODE.fullmatch(args[0]):
@@ -117,12 +132,18 @@ def _dtype(args: tuple, state: Any) -> np.dtype:
     return np.dtype("O" if code.startswith("O") else code).newbyteorder(order)
 
 
-def _make_array(shape: Any, dtype: Any, order: Any, data: Any) -> np.ndarray:
+def _check_room(size: int, room: int) -> None:
+    if size > room:
+        raise ValueError("it becomes far more than the file holds")
+
+
+def _make_array(shape: Any, dtype: Any, order: Any, data: Any, room: int) -> np.ndarray:
     """An array of checked size; nothing is allocated beyond the data at hand."""
     shape = check_sizes(shape)
     if not isinstance(dtype, np.dtype) or order not in ("C", "F"):
         raise ValueError("an array without type or order")
     count = math.prod(shape)
+    _check_room(count * dtype.itemsize, room)
     if dtype.hasobject:
         if not isinstance(data, list) or len(data) != count:
             raise ValueError(f"an array of shape {shape} without that many objects")
@@ -147,14 +168,15 @@ def check_sizes(given: Any) -> tuple[int, ...]:
     return tuple(int(n) for n in sizes)
 
 
-def _chumpy_select(args: tuple, state: Any) -> np.ndarray:
+def _chumpy_select(args: tuple, state: Any, room: int) -> np.ndarray:
     """Elements of an array, in a new shape."""
     flat = np.asarray(state["a"]).ravel()
     places = np.asarray(state["idxs"], dtype=np.int64)
+    _check_room(places.size * flat.itemsize, room)
     return flat[places].reshape(check_sizes(state["preferred_shape"]))
 
 
-def _sparse(kind: Callable[..., Any], args: tuple, state: Any) -> Any:
+def _sparse(kind: Callable[..., Any], args: tuple, state: Any, room: int) -> Any:
     """A matrix whose indices are checked: scipy's C code reads where they point."""
     parts = {str(key).lstrip("_"): part for key, part in state.items()}
     shape = check_sizes(parts["shape"])
@@ -176,7 +198,7 @@ def _sparse(kind: Callable[..., Any], args: tuple, state: Any) -> Any:
     return matrix
 
 
-def _storage(args: tuple, state: Any) -> Any:
+def _storage(args: tuple, state: Any, room: int) -> Any:
     """Numbers of one storage, flat, on the CPU, whatever device they came from.
 
     Every tensor of a pickle holds a whole torch file in the old layout. ``torch.load``
@@ -184,6 +206,7 @@ def _storage(args: tuple, state: Any) -> Any:
     """
     import torch  # slow to import, and few readers need it
 
+    _check_room(len(args[0]), room)
     file = io.BytesIO(_bytes(args[0]))
     magic, version, system, storage, keys = (_load(file, _Head) for _ in range(5))
     kind, name, key, _, length = storage[:5]
@@ -200,7 +223,7 @@ def _storage(args: tuple, state: Any) -> Any:
     return torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
 
 
-def _tensor(args: tuple, state: Any) -> Any:
+def _tensor(args: tuple, state: Any, room: int) -> Any:
     """A view of a storage as a tensor of its own, without gradient."""
     import torch
 
@@ -214,42 +237,48 @@ def _tensor(args: tuple, state: Any) -> Any:
     count = math.prod(sizes)
     if count and last >= flat.numel():
         raise ValueError(f"a tensor of shape {sizes} that leaves its storage")
-    if count * flat.element_size() > MAX_BYTES:
-        raise ValueError(f"a tensor of shape {sizes} becomes more than 2 GiB")
+    _check_room(count * flat.element_size(), room)
     return flat.as_strided(sizes, strides, offset if count else 0).clone()
+
+
+def _counted(room: int, items: Any = ()) -> Any:
+    _check_room(HASHED * len(items), room)
+    return items
 
 
 OBJECT = _stand_in(StandIn.make)
 ALLOWED: dict[str, type[StandIn]] = {
     "builtins.object": OBJECT,
-    "builtins.bytes": _stand_in(lambda args, _: b"".join(args)),  # called on nothing
-    "builtins.set": _stand_in(lambda args, _: set(*args)),
-    "builtins.frozenset": _stand_in(lambda args, _: frozenset(*args)),
+    "builtins.bytes": _stand_in(lambda args, *_: b"".join(args)),  # called on nothing
+    "builtins.set": _stand_in(lambda args, _, room: set(_counted(room, *args))),
+    "builtins.frozenset": _stand_in(
+        lambda args, _, room: frozenset(_counted(room, *args))
+    ),
     "collections.OrderedDict": _stand_in(
-        lambda args, items: dict([*(args[0] if args else ()), *(items or ())])
+        lambda args, items, _: dict([*(args[0] if args else ()), *(items or ())])
     ),
     "_codecs.encode": _stand_in(_encoded),
     "copyreg._reconstructor": _stand_in(_old_object),
     "numpy.ndarray": _stand_in(StandIn.make),
     "numpy.dtype": _stand_in(_dtype),
     "numpy.core.multiarray._reconstruct": _stand_in(
-        lambda _, s: _make_array(s[-4], s[-3], "F" if s[-2] else "C", s[-1])
+        lambda _, s, room: _make_array(s[-4], s[-3], "CF"[bool(s[-2])], s[-1], room)
     ),
     "numpy.core.multiarray.scalar": _stand_in(
-        lambda args, _: _make_array((), args[0], "C", args[1])[()]
+        lambda args, _, room: _make_array((), args[0], "C", args[1], room)[()]
     ),
     "numpy.core.numeric._frombuffer": _stand_in(  # pickle protocol 5
-        lambda args, _: _make_array(args[2], args[1], args[3], args[0])
+        lambda args, _, room: _make_array(args[2], args[1], args[3], args[0], room)
     ),
     "scipy.sparse.csc_matrix": _stand_in(partial(_sparse, sp.csc_matrix)),
     "scipy.sparse.csr_matrix": _stand_in(partial(_sparse, sp.csr_matrix)),
     "scipy.sparse.coo_matrix": _stand_in(partial(_sparse, sp.coo_matrix)),
-    "chumpy.ch.Ch": _stand_in(lambda _, state: np.asarray(state["x"])),
+    "chumpy.ch.Ch": _stand_in(lambda _, state, room: np.asarray(state["x"])),
     "chumpy.reordering.Select": _stand_in(_chumpy_select),
     "torch.storage._load_from_bytes": _stand_in(_storage),
     "torch._utils._rebuild_tensor": _stand_in(_tensor),
     "torch._utils._rebuild_tensor_v2": _stand_in(_tensor),
-    "torch._utils._rebuild_parameter": _stand_in(lambda args, _: args[0]),
+    "torch._utils._rebuild_parameter": _stand_in(lambda args, *_: args[0]),
 }
 
 
@@ -279,21 +308,22 @@ class _Head(_Unpickler):
         return pid
 
 
-class _HashCost:
-    """What hashing the keys of a pickle costs, followed without building them.
+class _Forecast:
+    """What a pickle will take, followed without building it: memory, and hashing.
 
     A tuple has no hash of its own: it is taken of all its parts, each time anew. Tuples
     of the same tuples double it with every level, a hundred bytes of file never end.
     """
 
-    def __init__(self) -> None:
-        self.total = 0
+    def __init__(self, room: int) -> None:
+        self.room, self.hashed = room, 0  # bytes; parts of keys
         self._stack: list[int] = []  # parts of each item; 0 is a mark
         self._memo: dict[int, int] = {}
 
     def add(self, name: str, part: Any, place: int) -> None:
         """Take in one step; ``place`` of the memo is the next that is free."""
         stack = self._stack
+        self.room -= STEPS.get(name, STEP)
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             self._memo[place if name == "MEMOIZE" else part] = stack[-1] if stack else 1
         elif name in ("GET", "BINGET", "LONG_BINGET"):
@@ -302,17 +332,19 @@ class _HashCost:
             stack.append(0 if name == "MARK" or not stack else stack[-1])
         else:
             self._apply(name, *STACK[name])
+        _check_room(0, self.room)
 
     def _apply(self, name: str, alone: int, to_mark: bool, left: int) -> None:
-        stack, taken = self._stack, 0
+        stack, taken, depth = self._stack, 0, len(self._stack)
         while to_mark and stack and (item := stack.pop()):
             taken += item
         if alone:
             taken += sum(stack[-alone:])
             del stack[-alone:]
         if name in HASHING:
-            self.total += taken
-            if self.total > MAX_HASHED:
+            self.room -= HASHED * (depth - len(stack))
+            self.hashed += taken
+            if self.hashed > MAX_HASHED:
                 raise pickle.UnpicklingError("keys that would take hours to compare")
         if left:
             stack += [1 + taken if name in TUPLES else 1] * left
@@ -324,9 +356,9 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
     The pickle machine itself allocates whatever a length or a place in its memo says,
     tens of gigabytes for ten bytes of file; after this check both are true.
     """
-    start, puts, cost = file.tell(), 0, _HashCost()
+    start, puts, forecast = file.tell(), 0, _Forecast(_room(file))
     for number, (code, part, _) in enumerate(pickletools.genops(file)):
-        cost.add(code.name, part, puts)
+        forecast.add(code.name, part, puts)
         if number > MAX_STEPS:
             raise pickle.UnpicklingError(f"more than {MAX_STEPS:,} steps")
         if code.name in ("PUT", "BINPUT", "LONG_BINPUT"):
@@ -342,6 +374,14 @@ def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
     return kind(file, encoding="latin1").load()
 
 
+def _room(file: IO[bytes]) -> int:
+    """Bytes that the rest of a file may become."""
+    start = file.tell()
+    size = file.seek(0, io.SEEK_END) - start
+    file.seek(start)
+    return min(MAX_BYTES, max(LEAST_ROOM, min(GROWTH * size, MOST_GROWN), 2 * size))
+
+
 def unpickle(file: IO[bytes]) -> Any:
     """The content of a pickle, of Python 2 or 3.
 
@@ -353,28 +393,25 @@ def unpickle(file: IO[bytes]) -> Any:
         RefusedError: it asks for anything else.
         ValueError: it is damaged; and nearly any other exception.
     """
+    room = _room(file)
     tree = _load(file)
     done: dict[int, Any] = {}
     # parts of each container, shared ones as often as they are met: lists of the same
     # lists make billions of a few bytes for whoever goes over them
     parts: dict[int, int] = {}
-    size = 0
 
     def plain(item: Any) -> Any:
-        nonlocal size
+        nonlocal room
         if type(item) in ATOMS:
             return item
         key = id(item)  # stays unique: the tree holds every item until the end
         if key not in done:
             done[key] = BUSY
-            made = done[key] = _convert(item, plain)
+            made = done[key] = _convert(item, plain, lambda: room)
             # one part of the file may be asked for in many forms, each a copy
-            length = len(made) if isinstance(made, (*CONTAINERS, dict)) else 0
-            copied = len(made) if isinstance(made, (bytes, str)) else 8 * length
-            size += getattr(made, "nbytes", 0) or copied
-            if size > MAX_BYTES:
-                raise ValueError("it becomes more than 2 GiB")
-            if length:
+            room -= getattr(made, "nbytes", 0) or sys.getsizeof(made)
+            _check_room(0, room)
+            if length := len(made) if isinstance(made, (*CONTAINERS, dict)) else 0:
                 inner = made.values() if isinstance(made, dict) else made
                 parts[id(made)] = length + sum(parts.get(id(i), 0) for i in inner)
                 if parts[id(made)] > MAX_PARTS:
@@ -386,10 +423,10 @@ def unpickle(file: IO[bytes]) -> Any:
     return plain(tree)
 
 
-def _convert(item: Any, plain: Callable[[Any], Any]) -> Any:
+def _convert(item: Any, plain: Callable[[Any], Any], room: Callable[[], int]) -> Any:
     if isinstance(item, StandIn):
         args = tuple(a if isinstance(a, type) else plain(a) for a in item.args)
-        made = type(item).make(args, plain(item.state))
+        made = type(item).make(args, plain(item.state), room())
         if isinstance(made, type):  # it may be an argument, but no value
             raise ValueError("a bare class is not data")
         return made

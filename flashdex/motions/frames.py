@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from flashdex.datasets.demo import HumanDemo
-from flashdex.datasets.tracks import angular_velocity, linear_velocity
 from flashdex.motions.contact.roles import NO_OBJECT, Interaction
 from flashdex.motions.contact.support import support_disks
 from flashdex.motions.library_format import NUM_OBJECT_SLOTS
 from flashdex.motions.library_writer import MotionRecord
 from flashdex.motions.retarget.solver import Choice
 from flashdex.motions.retarget.targets import Targets
+from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectAsset
 from flashdex.objects.meshes import hull_vertices
 
@@ -60,27 +60,20 @@ def _make_frames(
     motion: Interaction, joint_pos: np.ndarray, targets: Targets
 ) -> dict[str, np.ndarray]:
     """All per-frame entries of the library, float32."""
-    fps, wrist_pos = motion.fps, motion.keypoints[:, :, 0]
     poses = np.zeros((motion.num_frames, NUM_OBJECT_SLOTS, 7))
     poses[..., 3] = 1.0
     for slot, pose in enumerate(motion.poses):
         poses[:, slot] = pose
-    wrist_quat = targets.wrist_quat.numpy()
-    turns = [angular_velocity(wrist_quat[:, h], fps) for h in range(2)]
-    spins = [angular_velocity(poses[:, s, 3:], fps) for s in range(NUM_OBJECT_SLOTS)]
     entries = {
         "joint_pos": joint_pos,
-        "joint_vel": linear_velocity(joint_pos, fps),
-        "wrist_pos": wrist_pos,
-        "wrist_quat": wrist_quat,
-        "wrist_linvel": linear_velocity(wrist_pos, fps),
-        "wrist_angvel": np.stack(turns, axis=1),
+        "wrist_pos": motion.keypoints[:, :, 0],
+        "wrist_quat": targets.wrist_quat.numpy(),
         "keypoints": motion.keypoints,
-        "keypoint_linvel": linear_velocity(motion.keypoints, fps),
         "tip_dist": np.where(motion.active[:, None], motion.tip_dist, NO_OBJECT),
         "object_pos": poses[..., :3],
         "object_quat": poses[..., 3:],
-        "object_linvel": linear_velocity(poses[..., :3], fps),
-        "object_angvel": np.stack(spins, axis=1),
     }
-    return {k: v.astype(np.float32) for k, v in entries.items()}
+    frames = {k: v.astype(np.float32) for k, v in entries.items()}
+    # of what is stored, so that they follow from it to the last digit
+    speeds = derive_velocities(frames, motion.fps)
+    return frames | {k: v.astype(np.float32) for k, v in speeds.items()}

@@ -26,14 +26,19 @@ from flashdex.motions.library_format import (
     hash_json,
     is_hash,
 )
-from flashdex.motions.library_meshes import read_mesh
-from flashdex.motions.library_numbers import find_faults, part_fault
+from flashdex.motions.library_meshes import Mesh, read_mesh
+from flashdex.motions.library_numbers import (
+    find_faults,
+    grid_fault,
+    part_fault,
+    parts_fault,
+)
 from flashdex.objects.asset import default_cache_dir
 from flashdex.system.arrays import hash_content, map_array
 from flashdex.system.files import own_file
 
 Arrays = Mapping[str, np.ndarray]
-CHECK_VERSION = 1  # raise when a library is checked for more
+CHECK_VERSION = 2  # raise when a library is checked for more
 MAX_MARKS = 1000  # libraries that are remembered
 
 
@@ -44,17 +49,23 @@ def _changes(path: Path, manifest: Manifest, arrays: Arrays) -> Iterator[str]:
             file = own_file(path, manifest.data, f"{name}.npy")
         if hash_content(file) != entry.sha256:
             yield f"{name}: was changed; its hash is not that of the manifest"
-    bodies: dict[str, np.ndarray] = {}
+    bodies: dict[str, Mesh] = {}
     for name, digest in manifest.meshes.items():
         try:
-            bodies[name] = read_mesh(path, manifest.data, name, digest)[0]
+            bodies[name] = read_mesh(path, manifest.data, name, digest)
         except LibraryError as error:
             yield str(error)
     for row, entry in enumerate(manifest.entries["objects"]):
-        box = arrays["objects/aabb"][row]
+        body = {key: arrays[f"objects/{key}"][row] for key in OBJECT_KEYS}
         for file in entry["parts"]:
-            if file in bodies and (fault := part_fault(bodies[file], box)):
+            if file in bodies and (fault := part_fault(bodies[file][0], body["aabb"])):
                 yield f"{file}: {fault}"
+        if all(file in bodies for file in (*entry["parts"], entry["visual"])):
+            parts = [bodies[file][0] for file in entry["parts"]]
+            fault = parts_fault(parts, body["aabb"])
+            mesh = bodies[entry["visual"]]
+            if fault := fault or grid_fault(body, mesh, manifest.seed + row):
+                yield f"object {entry['name']!a}: {fault}"
     if len(bodies) == len(manifest.meshes):
         yield from _exchanged(manifest, arrays)
 

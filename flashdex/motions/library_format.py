@@ -100,6 +100,11 @@ class Manifest:
     meshes: dict[str, str]  # path below ``data`` to SHA-256
     sha256: str  # of all it says, and so of all the library holds
 
+    @property
+    def seed(self) -> int:
+        """Of what is drawn to check the library; the same for the same content."""
+        return int(self.sha256[:15], 16)
+
     def names(self, part: Literal["motions", "objects"]) -> list[str]:
         """Names of the motions or objects, in row order."""
         return [row["name"] for row in self.entries[part]]
@@ -276,9 +281,9 @@ def hash_json(value: Any) -> str:
 
 
 @contextmanager
-def as_library_error() -> Iterator[None]:
+def as_library_error(hint: str = AGAIN) -> Iterator[None]:
     """A library's files are a run's files but for the error."""
     try:
         yield
     except RunError as error:
-        raise LibraryError(f"{error} {AGAIN}") from error
+        raise LibraryError(f"{error} {hint}".strip()) from error

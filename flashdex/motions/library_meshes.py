@@ -16,7 +16,8 @@ from flashdex.objects.asset import ObjectAsset
 from flashdex.system.files import open_plain, own_file
 from flashdex.system.names import file_stem
 
-MAX_MESH = 64 << 20  # bytes; a visual mesh has 5,000 triangles
+MAX_MESH = 64 << 20  # bytes
+MAX_FACES = 20_000  # a visual mesh has 5,000, a convex part twice its vertices
 Mesh = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
@@ -74,19 +75,28 @@ def read_mesh(path: Path, data: str, name: str, sha256: str) -> Mesh:
             return _parse_obj(text.decode("ascii"))
     except FileNotFoundError:
         fault = "is missing"
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         fault = f"cannot be read ({error})"
     raise LibraryError(f"{file}: {fault}. {AGAIN}")
 
 
 def _parse_obj(text: str) -> Mesh:
-    lines = [line.split() for line in text.splitlines()]
-    points = [words[1:4] for words in lines if words[:1] == ["v"]]
-    corners = [words[1:4] for words in lines if words[:1] == ["f"]]
-    vertices = np.array(points, np.float32).reshape(-1, 3)
-    faces = np.array(corners, np.int64).reshape(-1, 3) - 1
+    lines = text.splitlines()
+    if (count := sum(line.startswith("f ") for line in lines)) > MAX_FACES:
+        raise ValueError(f"it has {count} triangles, {MAX_FACES} are allowed")
+    vertices, faces = (
+        np.array(_words(lines, kind), number).reshape(-1, 3)
+        for kind, number in (("v ", np.float32), ("f ", np.int64))
+    )
+    faces -= 1
     if not np.isfinite(vertices).all() or len(vertices) < 4 or len(faces) < 1:
         raise ValueError("it has no body, or numbers that are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("a triangle names a vertex that is not there")
     return vertices, faces
+
+
+def _words(lines: list[str], kind: str) -> list[float] | list[int]:
+    # one split of all lines of a kind: a library holds a million of them
+    words = " ".join([line[2:] for line in lines if line.startswith(kind)]).split()
+    return list(map(float if kind == "v " else int, words))

@@ -31,13 +31,14 @@ from flashdex.motions.library_format import (
     OBJECT_KEYS,
     QUALITY_KEYS,
     SCHEMA,
+    as_library_error,
     parse_manifest,
     read_manifest,
 )
 from flashdex.motions.library_meshes import write_meshes
 from flashdex.objects.asset import ObjectAsset
 from flashdex.system.arrays import write_array
-from flashdex.system.files import open_plain, waiting_lock, write_atomic
+from flashdex.system.files import open_plain, own_file, waiting_lock, write_atomic
 from flashdex.system.names import check_name, file_stem
 
 # what is no part of the name of an object, and how long one may be
@@ -259,11 +260,9 @@ def check_target(path: Path) -> None:
             f"{path}: could not write the library: {folder} refuses ({error.strerror})."
         ) from error
     if folder is path:
-        blocked = [n for n in (REPORT, PAGE) if _is_folder(path / n)]
-        if blocked:
-            raise LibraryError(
-                f"{path / blocked[0]}: is a folder, a library has a file of this name."
-            )
+        with as_library_error(hint=""):
+            for name in (REPORT, PAGE):
+                own_file(path, name)
         held = [n for n in os.listdir(path) if n != LOCK]
         ours = [n for n in held if DATA.fullmatch(n) or TEMPORARY.fullmatch(n)]
         if len(ours) < len(held) and not _is_library(path):

@@ -14,6 +14,11 @@ from scipy.spatial import ConvexHull
 
 from flashdex.objects.signed_distance import winding_number
 
+# What a hand moves: kg, from a gram up; kg/m3 of its convex parts, foam to tungsten;
+# and m, the largest distance from its middle.
+MASS = (1e-3, 20.0)
+DENSITY = (5.0, 25_000.0)
+MAX_SIZE = 3.0
 MAX_NESTED = 100  # bodies between which nesting is sought; more stand side by side
 LEAST_FILL = 1e-3  # share of its hull that a solid has
 NUM_SAMPLES = 16  # vertices of a body that must all be inside of another

@@ -83,6 +83,17 @@ def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Ar
     return best
 
 
+def triangle_distance(triangles: Array, points: Array) -> Array:
+    """Unsigned distance from few points (N, 3) to the nearest of (F, 3, 3), m, (N,).
+
+    Each is compared with each; see ``surface_distance`` for many points.
+    """
+    sides = triangles[:, 1:] - triangles[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
+    frames = _triangle_frames(triangles[area > 1e-12 * area.max()])
+    return np.sqrt([_squared_distance(p, frames).min(initial=np.inf) for p in points])
+
+
 def winding_number(triangles: Array, points: Array) -> Array:
     """Generalised winding number: the share of the sphere of view the mesh covers.
 

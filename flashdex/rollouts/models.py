@@ -21,6 +21,7 @@ from flashdex.envs.scene.parts import INERTIA_OFFSET
 from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
+from flashdex.objects.bodies import DENSITY, MASS, MAX_SIZE
 
 if TYPE_CHECKING:
     from flashdex.envs.physics.config import PhysicsConfig
@@ -33,10 +34,7 @@ _DERIVED = ("bvh_", "oct_", "mesh_octadr", "mesh_octnum")
 # and flags of equal frames follow from what is compared.
 _OF_AXES = ("body_iquat", "body_inertia")
 _OF_FRAMES = "_sameframe"
-MASS = (1e-3, 20.0)  # kg, of an object that a hand moves
-DENSITY = (5.0, 25_000.0)  # kg/m3 of its convex parts; foam to tungsten
 MAX_FRICTION = 5.0
-MAX_SIZE = 3.0  # m, of an object or a support
 
 
 def compare_models(

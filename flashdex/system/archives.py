@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -89,14 +90,26 @@ def read_npz(path: Path, *, limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_array(data: bytes) -> np.ndarray:
+def read_array(
+    data: bytes, *, unpickle: Callable[[IO[bytes]], Any] | None = None
+) -> Any:
     """The array of the bytes of a ``.npy``; its own memory, nothing beyond the data.
 
+    Args:
+        data: of the file.
+        unpickle: reads an array of objects; the only one of it, where it has no axes.
+
     Raises:
-        ValueError: damaged, of objects, or its shape does not fit to the bytes.
+        ValueError: damaged, of objects without ``unpickle``, or its shape does not fit
+            to the bytes.
     """
     file = io.BytesIO(data)
-    shape, by_columns, dtype = read_header(file)
+    shape, by_columns, dtype = read_header(file, objects=unpickle is not None)
+    if unpickle is not None and dtype.kind == "O":
+        array = unpickle(file)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
+            raise ValueError("an object array that holds something else")
+        return array.item() if array.ndim == 0 else array
     count, start = math.prod(shape), file.tell()
     if count * dtype.itemsize != len(data) - start:
         raise ValueError(f"{shape} of {dtype} does not fit to {len(data)} bytes")
@@ -104,28 +117,28 @@ def read_array(data: bytes) -> np.ndarray:
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
-def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def read_header(
+    file: IO[bytes], *, objects: bool = False
+) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, whether by columns, and type of a ``.npy``; the file stands at its data.
 
     Raises:
-        ValueError: damaged, of objects or of nothing, or with impossible sizes.
+        ValueError: damaged, of nothing, with impossible sizes, or of objects where
+            these are not wanted.
     """
     try:
         version = np.lib.format.read_magic(file)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
+        read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
         shape, by_columns, dtype = read(file, max_header_size=MAX_HEADER)
     except ValueError:
         raise
+    except MemoryError:  # Python's parser says so of text that is too deep for it
+        raise ValueError("its header is nested too deep") from None
     except Exception as error:
         raise ValueError(f"not the header of an array ({error})") from error
-    if (
-        dtype.hasobject
-        or dtype.names
-        or (dtype.itemsize == 0 and dtype.kind not in "US")
-    ):
+    is_plain = not dtype.hasobject and not dtype.names
+    is_empty = dtype.itemsize == 0 and dtype.kind not in "US"
+    if is_empty or not (is_plain or (objects and dtype.kind == "O")):
         raise ValueError(f"it holds {dtype}, not plain numbers or text")
     if any(not 0 <= n <= MAX_BYTES for n in shape) or len(shape) > 32:
         raise ValueError(f"{shape} are not sizes")

@@ -7,8 +7,11 @@ from flashdex.datasets.demo import HumanDemo
 from flashdex.errors import DemoError
 
 
-def test_sound_demo_is_accepted(still_demo):
+def test_sound_demo_is_accepted_and_stays_as_it_is(still_demo):
+    before = still_demo.keypoints["right"].copy(), still_demo.objects[0].pose.copy()
     still_demo.validate()
+    np.testing.assert_array_equal(still_demo.keypoints["right"], before[0])
+    np.testing.assert_array_equal(still_demo.objects[0].pose, before[1])
 
 
 def break_nan(demo):

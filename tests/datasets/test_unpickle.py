@@ -1,6 +1,7 @@
 """Files with pickles: data come back exactly, everything else is refused."""
 
 import builtins
+import codecs
 import collections
 import io
 import os
@@ -472,24 +473,41 @@ def test_lengths_that_are_not_there_cost_nothing(stored, greedy):
     assert peak < 10e6
 
 
-@pytest.mark.parametrize("kind", ["arrays", "tensors", "sets"])
-def test_small_files_that_grow_are_stopped(stored, monkeypatch, kind):
-    monkeypatch.setattr(pickles, "MAX_BYTES", 10**6)
-    if kind == "arrays":  # 200 arrays of the same 10 kB
-        state = (1, (10_000,), np.dtype("u1"), False, bytes(10_000))
-        empty = np._core.multiarray._reconstruct
-        parts = [Built(Call(empty, np.ndarray, (0,), b"b"), state) for _ in range(200)]
-    elif kind == "tensors":  # one number, seen 10^6 times
-        typed = torch.ones(1)._typed_storage()
-        again = (typed, 0, (10**6,), (0,), False, collections.OrderedDict())
-        parts = Call(torch._utils._rebuild_tensor_v2, *again)
-    else:
-        numbers = list(range(10_000))
-        parts = [Call(set, numbers) for _ in range(200)]
-    path = stored(parts)
+def again(*what, count=200):
+    """The same arguments for the same function, many times."""
+    return [
+        Built(Call(*call), state) if state else Call(*call)
+        for call, state in [what] * count
+    ]
+
+
+EMPTY_ARRAY = (np._core.multiarray._reconstruct, np.ndarray, (0,), b"b")
+SEEN = (torch.ones(1)._typed_storage(), 0, (10**6,), (0,), False)
+SEEN += (collections.OrderedDict(),)
+GROWING = {
+    "arrays": again(EMPTY_ARRAY, (1, (9000,), np.dtype("u1"), False, bytes(9000))),
+    "objects": again(EMPTY_ARRAY, (1, (9000,), np.dtype("O"), False, [0] * 9000)),
+    "tensors": again((torch._utils._rebuild_tensor_v2, *SEEN), None, count=1),
+    "sets": again((set, list(range(9000))), None),
+    "texts": again((codecs.encode, "x" * 9000, "latin1"), None),
+    "empty_sets": b"\x80\x04(" + b"\x8f" * 20_000 + b"l.",
+    "empty_tables": b"\x80\x04(" + b"}" * 20_000 + b"l.",
+    "objects_of_a_class": b"\x80\x02cnumpy\ndtype\nq\0(" + b"h\0)\x81" * 6000 + b"l.",
+}
+
+
+@pytest.mark.parametrize("case", GROWING)
+def test_small_files_that_grow_are_stopped(stored, monkeypatch, case):
+    for name in ("LEAST_ROOM", "MOST_GROWN"):
+        monkeypatch.setattr(pickles, name, 10**6)
+    path = stored(GROWING[case])
     assert path.stat().st_size < 10**5
-    with pytest.raises(DemoError, match="more than 2 GiB"):
+    tracemalloc.start()
+    with pytest.raises(DemoError, match="far more than the file holds"):
         load_pickle(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4e6  # not all in vain, but little more than is allowed
 
 
 @pytest.mark.parametrize(("count", "told"), [(10**9, "not fit"), (10**12, "sizes")])
@@ -541,7 +559,7 @@ def test_files_of_another_kind(tmp_path, stored, load):
 def test_structured_arrays_with_objects_are_refused(tmp_path):
     kind = np.dtype([("a", object)])
     np.save(tmp_path / "a.npy", np.zeros(2, kind), allow_pickle=True)
-    with pytest.raises(DemoError, match="does not fit"):
+    with pytest.raises(DemoError, match="not plain numbers or text"):
         load_npy(tmp_path / "a.npy")
 
 

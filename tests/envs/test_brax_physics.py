@@ -329,7 +329,7 @@ def test_motions_with_other_objects_are_refused(library, hands):
 
 
 def test_motions_of_the_same_objects_are_not_refused(reduced):
-    refuse_unlike_objects(reduced)
+    assert refuse_unlike_objects(reduced) is None
 
 
 @pytest.mark.slow

@@ -366,8 +366,9 @@ def test_no_call_waits_for_the_device(trio, start, bank, targets):
             trio.reset(mask, **state)
             trio.step(targets[0])
             trio.step(targets[1], wrench)
-            trio.state()
+            found = trio.state()
             trio.raw()
+    assert not found["bad"].any()
 
 
 def test_the_guard_sees_what_waits():

@@ -15,6 +15,7 @@ from flashdex.motions import library_writer
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_format import FRAME_KEYS
 from flashdex.motions.library_writer import LibraryWriter, MotionRecord
+from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectSettings, make_object
 
 SHAPES = {
@@ -52,14 +53,16 @@ def draw(rng, key, shape):
     values = rng.normal(size=shape)
     if key.endswith("_quat"):
         return values / np.linalg.norm(values, axis=-1, keepdims=True)
-    return np.abs(values) if key == "tip_dist" else values
+    # decimetres: a recording moves no faster than a few metres a second
+    return np.abs(values) if key == "tip_dist" else 0.1 * values
 
 
 def make_record(name, frames, objects, seed):
     rng = np.random.default_rng(seed)
+    drawn = {k: draw(rng, k, (frames, *s)) for k, s in SHAPES.items()}
     return MotionRecord(
         name=name,
-        frames={k: draw(rng, k, (frames, *s)) for k, s in SHAPES.items()},
+        frames=drawn | derive_velocities(drawn, 60.0),
         hand_active=(False, True),
         hand_object=(-1, 0),
         objects=objects,
@@ -161,6 +164,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import test_library as t
 from flashdex.motions import library_writer
+from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectSettings, make_object
 import trimesh
 coarse = ObjectSettings(sdf_resolution=12)

@@ -4,8 +4,9 @@ import errno
 import os
 import shutil
 
+import numpy as np
 import pytest
-from mutations import snapshot
+from mutations import KINDS, snapshot
 from synthetic import make_box
 from test_library import make_record, write
 
@@ -13,6 +14,7 @@ from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
 from flashdex.motions.library_writer import LibraryWriter
 from flashdex.motions.pipeline.prepare import Order, run_order
+from flashdex.reports.library.report import write_library_report
 
 
 @pytest.fixture
@@ -151,13 +153,17 @@ def test_a_pipe_among_its_data_is_not_waited_for(copy, record):
     assert pipe.is_fifo()
 
 
+@pytest.mark.parametrize("kind", ["folder", "link", "dangling", "fifo"])
 @pytest.mark.parametrize("name", ["report.csv", "report.html"])
-def test_a_folder_in_the_place_of_a_report_is_refused(copy, record, name):
-    (copy / name).unlink(missing_ok=True)
-    (copy / name).mkdir()
+def test_what_is_no_report_is_refused_and_stays(copy, record, name, kind):
+    (copy / name).write_text("mine")
+    KINDS[kind](copy / name, np.random.default_rng(0))
     before = snapshot(copy)
-    with pytest.raises(LibraryError, match=f"{name}: is a folder"):
+    with pytest.raises(LibraryError, match=rf"{name}: is a .*, not a file of its own"):
         write([record], copy)
+    if name == "report.html":
+        with pytest.raises(LibraryError, match="not a file of its own"):
+            write_library_report(MotionLibrary.load(copy), thumbnails=False)
     assert snapshot(copy) == before
 
 

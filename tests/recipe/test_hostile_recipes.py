@@ -233,7 +233,7 @@ def test_a_strange_promise_does_not_break_the_list(expect, tmp_path, monkeypatch
 
 
 PATHS = (
-    "/home/josé/libs",
+    "/data/josé/libs",
     "/data/数据",
     "/data/run=3",
     "/data/(stir, spoon, bowl)",
@@ -267,8 +267,8 @@ def test_a_path_is_a_path(key, path):
 
 
 def test_a_leading_tilde_is_the_home_folder(monkeypatch):
-    monkeypatch.setenv("HOME", "/home/me")
-    assert compose("quickstart", ["run_dir=~/a b"]).run_dir == "/home/me/a b"
+    monkeypatch.setenv("HOME", "/data/me")
+    assert compose("quickstart", ["run_dir=~/a b"]).run_dir == "/data/me/a b"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import base64
 import csv
-import dataclasses
 import io
 import re
 import shutil
@@ -15,10 +14,12 @@ import pytest
 import torch
 from mutations import KINDS
 from PIL import Image
-from synthetic import write_library
+from synthetic import data_of, forge_library, write_library
 
 from flashdex.errors import LibraryError
+from flashdex.motions import library_check
 from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import read_manifest
 from flashdex.reports.library import report as library_report
 from flashdex.reports.library.charts import (
     contact_timeline,
@@ -439,15 +440,17 @@ def test_pictures_show_objects_and_hands(mine, backend):
 
 
 def test_a_motion_that_cannot_be_drawn_does_not_spoil_the_others(
-    hands, tmp_path, backend
+    plain, backend, tmp_path, monkeypatch
 ):
-    def flatten(record):  # a surface that MuJoCo takes for no mesh
-        shape = {"visual_vertices": np.zeros((4, 3), np.float32)}
-        shape["visual_faces"] = np.array([[0, 1, 2]], np.int32)
-        record.objects = [dataclasses.replace(record.objects[0], sha256="f", **shape)]
-
-    library = write_library(tmp_path / "a", hands, changes={"right_box": [flatten]})
-    drawn, fault = draw_thumbnails(library, [0, 1])
+    # a surface that MuJoCo takes for no mesh, in a library that counts as checked
+    monkeypatch.setenv("FLASHDEX_CACHE", str(tmp_path / "cache"))
+    file = data_of(plain.path) / plain.manifest["objects"][0]["visual"]
+    file.write_text("v 0 0 0\n" * 4 + "f 1 2 3\n")
+    forge_library(plain.path, lambda entries, arrays: None)
+    mark = library_check._mark(plain.path, read_manifest(plain.path))
+    mark.parent.mkdir(parents=True)
+    mark.touch()
+    drawn, fault = draw_thumbnails(MotionLibrary.load(plain.path), [0, 1])
     assert list(drawn) == [1]
     assert fault.startswith("no pictures of 1 of 2 motions: right_box: ")
 

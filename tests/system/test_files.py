@@ -120,7 +120,8 @@ def test_a_disk_that_refuses_to_unlock_keeps_nobody_out(tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_made_is_worked_in_without_a_lock(tmp_path):
     (tmp_path / "file").write_text("")
     with waiting_lock(tmp_path / "file" / "asset"):
-        pass
+        (tmp_path / "worked").touch()
+    assert sorted(os.listdir(tmp_path)) == ["file", "worked"]
 
 
 def test_own_files_lie_below_their_folder(tmp_path):

@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 
 import pytest
-from synthetic import forge_library
+from synthetic import forge_library, renew_velocities
 
 from flashdex.envs.config import EnvConfig
 from flashdex.envs.physics.config import PhysicsConfig
@@ -40,6 +40,7 @@ def without_a_joint(entries, arrays):
 
 def bent_too_far(entries, arrays):
     arrays["frames/joint_pos"][60, 0, 8] = 9.0
+    renew_velocities(arrays)
 
 
 def without_objects(entries, arrays):
@@ -49,6 +50,7 @@ def without_objects(entries, arrays):
 
 def bent_by_an_idle_hand(entries, arrays):
     arrays["frames/joint_pos"][:40, 0, 8] = 9.0  # motion 0 is of the right hand
+    renew_velocities(arrays)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
+from flashdex.motions.library_format import as_library_error
 from flashdex.reports.library.charts import FIGURES, histogram, motion_charts
 from flashdex.reports.library.facts import (
     CODES,
@@ -24,6 +25,7 @@ from flashdex.reports.library.facts import (
 from flashdex.reports.page import write_page
 from flashdex.reports.render.stills import draw_thumbnails, still_frames
 from flashdex.reports.text import MAX_WIDTH, align, duration, plain, shorten
+from flashdex.system.files import own_file
 
 REPORT = "report.html"
 MAX_CARDS = 150  # a page of 2,000 cards would not open
@@ -47,12 +49,15 @@ def write_library_report(
     Raises:
         LibraryError: ``report.csv`` is not a table, or the page cannot be written.
     """
+    if path is None:
+        with as_library_error(hint=""):
+            path = own_file(library.path, REPORT)
     recordings = library_facts(library)
     inside = {one.row: one for one in recordings if one.row is not None}
     rows = list(inside)[:max_cards]
     stills, fault = draw_thumbnails(library, rows) if thumbnails else ({}, "")
     return write_page(
-        library.path / REPORT if path is None else path,
+        path,
         "library.html",
         error=LibraryError,
         name=library.path.resolve().name,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-import math
 import pickle
 import re
 import zipfile
@@ -17,12 +15,13 @@ from typing import IO, Any
 import numpy as np
 
 from flashdex.datasets.pickles import MAX_BYTES, RefusedError, unpickle
-from flashdex.datasets.pickles import check_sizes as check_shape
 from flashdex.errors import DemoError, is_of_machine
-from flashdex.system.archives import check_sizes
+from flashdex.system.archives import open_archive, read_data, read_header
+from flashdex.system.jsonl import parse_json
+from flashdex.system.pickled import check_tensors
 
 POINTER_START = b"version https://git-lfs"
-MAX_TEXT = 256 << 20  # bytes of a text file
+MAX_TEXT = 64 << 20  # bytes of a text file; lines and cells take fifty times as much
 POINTER_SIZE = 200  # bytes; a pointer holds three short lines
 # what is raised by content of another layout, or nested too deep
 BROKEN = (
@@ -100,7 +99,7 @@ def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[
 def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
     """The content of a JSON file; ``fault`` says of another file what it is not."""
     with told(file, fault, code=code):
-        return json.loads(read_text(file))
+        return parse_json(read_bytes(file, most=MAX_TEXT))
 
 
 def read_text(file: Path) -> str:
@@ -123,7 +122,8 @@ def load_pickle(path: Path) -> Any:
 
 def load_npy(path: Path) -> Any:
     """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _open(path, ".npy array", lambda file: _read_array(file.read()))
+    size = path.stat().st_size if path.is_file() else 0
+    return _open(path, ".npy array", partial(_read_array, size=size))
 
 
 def load_npz(
@@ -180,46 +180,35 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
         ) from error
 
 
-def _read_array(data: bytes) -> Any:
-    file = io.BytesIO(data)
-    version = "_".join(map(str, np.lib.format.read_magic(file)))
-    read_header = getattr(np.lib.format, f"read_array_header_{version}")
-    try:
-        shape, by_columns, dtype = read_header(file)
-    except MemoryError:  # Python's parser says so of text that is too deep for it
-        raise ValueError("its header is nested too deep") from None
-    if dtype.kind == "O":
-        array = unpickle(file)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
-            raise ValueError("an object array that holds something else")
-        return array.item() if array.ndim == 0 else array
-    count = math.prod(check_shape(shape))
-    if dtype.hasobject or count * dtype.itemsize > len(data):
-        raise ValueError(f"shape {shape} of {dtype} does not fit to {len(data)} bytes")
-    raw = bytearray(file.read(count * dtype.itemsize))
-    return np.frombuffer(raw, dtype, count).reshape(
-        shape, order="F" if by_columns else "C"
-    )
+def _read_array(file: IO[bytes], size: int) -> Any:
+    header = read_header(file, objects=True)
+    if header[2].kind != "O":
+        return read_data(file, size, header)
+    array = unpickle(io.BytesIO(file.read()))
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
+        raise ValueError("an object array that holds something else")
+    return array.item() if array.ndim == 0 else array
 
 
 def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
-    with zipfile.ZipFile(file) as archive:
-        check_sizes(archive, limit=MAX_BYTES)
+    with open_archive(file, limit=MAX_BYTES) as archive:
         files = [name for name in archive.namelist() if name.endswith(".npy")]
         if not files:
             raise ValueError("it holds no .npy entries")
         names = {name.removesuffix(".npy"): name for name in files}
         wanted = {k: v for k, v in names.items() if only is None or k in only}
-        return {k: _read_array(archive.read(name)) for k, name in wanted.items()}
+        return {k: _read_member(archive, name) for k, name in wanted.items()}
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> Any:
+    with archive.open(name) as file:
+        return _read_array(file, archive.getinfo(name).file_size)
 
 
 def _read_torch(file: IO[bytes]) -> Any:
     import torch  # slow to import, and few readers need it
 
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            check_sizes(archive, limit=MAX_BYTES)
-    file.seek(0)
+    check_tensors(file, limit=MAX_BYTES)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import pickletools
 import re
 import struct
 from collections.abc import Callable
@@ -22,26 +21,14 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
+from flashdex.system.pickled import MAGIC, check_steps
+
 MAX_BYTES = 2 << 30  # of what a file becomes; more is a mistake or an attack
-MAX_STEPS = 20_000_000  # of the pickle machine, some seconds
-MAX_INT = 2**64  # of a number that is no magic
-MAX_HASHED = 200_000_000  # parts of keys, some seconds
-TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3")
-HASHING = ("SETITEM", "SETITEMS", "DICT", "ADDITEMS", "FROZENSET")
-# of each step: items it takes, whether all down to a mark as well, items it leaves
-STACK = {
-    code.name: (
-        [*code.stack_before, pickletools.markobject].index(pickletools.markobject),
-        pickletools.markobject in code.stack_before,
-        len(code.stack_after),
-    )
-    for code in pickletools.opcodes
-}
 MAX_PARTS = 50_000_000  # of the containers of a file
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
-# what an old torch file begins with, its version, and the storages it may hold
-MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001
+# what an old torch file begins with (and ``MAGIC``), and the storages it may hold
+VERSION = 1001
 STORAGES = {
     **{"DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16"},
     **{"BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32"},
@@ -279,65 +266,9 @@ class _Head(_Unpickler):
         return pid
 
 
-class _HashCost:
-    """What hashing the keys of a pickle costs, followed without building them.
-
-    A tuple has no hash of its own: it is taken of all its parts, each time anew. Tuples
-    of the same tuples double it with every level, a hundred bytes of file never end.
-    """
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._stack: list[int] = []  # parts of each item; 0 is a mark
-        self._memo: dict[int, int] = {}
-
-    def add(self, name: str, part: Any, place: int) -> None:
-        """Take in one step; ``place`` of the memo is the next that is free."""
-        stack = self._stack
-        if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
-            self._memo[place if name == "MEMOIZE" else part] = stack[-1] if stack else 1
-        elif name in ("GET", "BINGET", "LONG_BINGET"):
-            stack.append(self._memo.get(part, 1))
-        elif name in ("MARK", "DUP"):
-            stack.append(0 if name == "MARK" or not stack else stack[-1])
-        else:
-            self._apply(name, *STACK[name])
-
-    def _apply(self, name: str, alone: int, to_mark: bool, left: int) -> None:
-        stack, taken = self._stack, 0
-        while to_mark and stack and (item := stack.pop()):
-            taken += item
-        if alone:
-            taken += sum(stack[-alone:])
-            del stack[-alone:]
-        if name in HASHING:
-            self.total += taken
-            if self.total > MAX_HASHED:
-                raise pickle.UnpicklingError("keys that would take hours to compare")
-        if left:
-            stack += [1 + taken if name in TUPLES else 1] * left
-
-
 def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
-    """One pickle, read over once from its start to its end before it builds anything.
-
-    The pickle machine itself allocates whatever a length or a place in its memo says,
-    tens of gigabytes for ten bytes of file; after this check both are true.
-    """
-    start, puts, cost = file.tell(), 0, _HashCost()
-    for number, (code, part, _) in enumerate(pickletools.genops(file)):
-        cost.add(code.name, part, puts)
-        if number > MAX_STEPS:
-            raise pickle.UnpicklingError(f"more than {MAX_STEPS:,} steps")
-        if code.name in ("PUT", "BINPUT", "LONG_BINPUT"):
-            if not isinstance(part, int) or part > puts:
-                raise pickle.UnpicklingError("the memo of the pickle is not in order")
-            puts += 1
-        elif code.name == "MEMOIZE":
-            puts += 1
-        elif isinstance(part, int) and abs(part) > MAX_INT and part != MAGIC:
-            # keys of one hash, and text of it, take time that grows with the square
-            raise pickle.UnpicklingError("a number of more than 64 bits")
+    start = file.tell()
+    check_steps(file)
     file.seek(start)
     return kind(file, encoding="latin1").load()
 

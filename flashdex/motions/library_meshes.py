@@ -16,7 +16,7 @@ from flashdex.objects.asset import ObjectAsset
 from flashdex.system.files import open_plain, own_file
 from flashdex.system.names import file_stem
 
-MAX_MESH = 64 << 20  # bytes; a visual mesh has 5,000 triangles
+MAX_MESH = 8 << 20  # bytes; a visual mesh has 5,000 triangles, 0.3 million bytes
 Mesh = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 

@@ -21,9 +21,11 @@ from torch import Tensor
 
 from flashdex.system.archives import MAX_BYTES, check_archive
 from flashdex.system.files import open_own, open_plain, own_file
+from flashdex.system.pickled import check_tensors
 
 SEAL = re.compile(rb"sha256:([0-9a-f]{64})")
 SEAL_BYTES = 71
+MAX_PARTS, MAX_DEPTH = 1_000_000, 32
 # Raw simulator states, which may hold anything once a world diverges.
 RAW = frozenset({"nstep"})
 
@@ -89,7 +91,7 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
                 raise ValueError("its seal is missing: damaged, or of another version")
             file.seek(0)
             check_archive(file)
-            file.seek(0)
+            check_tensors(file, limit=MAX_BYTES)
             content = torch.load(file, map_location="cpu", weights_only=True)
     except ValueError:
         raise
@@ -99,8 +101,12 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
         raise ValueError(words.splitlines()[0]) from error
     if isinstance(content, dict) and content.get("sealed") is True and not has_seal:
         raise ValueError("its seal is missing: it is damaged")
-    if (size := _size(content)) > MAX_BYTES:
+    tensors = [part for part in _parts(content) if isinstance(part, Tensor)]
+    # a view may claim more than the file holds
+    if (size := sum(t.numel() * t.element_size() for t in tensors)) > MAX_BYTES:
         raise ValueError(f"its tensors claim {size >> 20} MiB")
+    if any(t.layout != torch.strided or t.is_meta or t.is_quantized for t in tensors):
+        raise ValueError("it holds a tensor that is not plain")
     return content
 
 
@@ -121,15 +127,25 @@ def _check_seal(file: BinaryIO) -> bool:
     return True
 
 
-def _size(content: Any) -> int:
-    """Bytes of all tensors; a view may claim more than the file holds."""
-    if isinstance(content, Mapping):
-        return sum(_size(value) for value in content.values())
-    if isinstance(content, list | tuple):
-        return sum(_size(value) for value in content)
-    if isinstance(content, Tensor):
-        return content.numel() * content.element_size()
-    return 0
+def _parts(content: Any) -> list[Any]:
+    """All parts of a content, shared ones as often as whoever goes over it meets them.
+
+    Raises:
+        ValueError: they are more than any file of a run has, or nested without end.
+    """
+    parts, level = [], [content]
+    for _ in range(MAX_DEPTH):
+        parts += level
+        inner = []
+        for part in level:
+            inner += part.values() if isinstance(part, Mapping) else ()
+            inner += part if isinstance(part, list | tuple) else ()
+            if len(parts) + len(inner) > MAX_PARTS:
+                raise ValueError(f"it has more than {MAX_PARTS} parts")
+        level = inner
+    if level:
+        raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep")
+    return parts
 
 
 def first_non_finite(state: Any, path: str = "") -> str:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from flashdex.datasets import pickles
 from flashdex.datasets.fields import numbers
 from flashdex.datasets.files import (
     load_npy,
@@ -24,6 +23,7 @@ from flashdex.datasets.files import (
     read_text,
 )
 from flashdex.errors import DemoError
+from flashdex.system import pickled
 
 LOADERS = {
     "pickle": load_pickle,
@@ -218,7 +218,7 @@ def test_pickle_of_one_large_key_many_times(tmp_path):
 
 
 def test_pickle_of_endless_steps_is_one_message(tmp_path, monkeypatch):
-    monkeypatch.setattr(pickles, "MAX_STEPS", 1000)
+    monkeypatch.setattr(pickled, "MAX_STEPS", 1000)
     path = tmp_path / "a.pkl"
     path.write_bytes(b"N0" * 2000 + b"N.")
     with pytest.raises(DemoError, match="more than 1,000 steps"):

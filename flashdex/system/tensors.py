@@ -19,13 +19,18 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from flashdex.system.archives import MAX_BYTES, check_archive
+from flashdex.system.archives import MAX_BYTES, RATIO_FROM, check_archive
 from flashdex.system.files import open_own, open_plain, own_file
 from flashdex.system.pickled import check_tensors
 
 SEAL = re.compile(rb"sha256:([0-9a-f]{64})")
 SEAL_BYTES = 71
 MAX_PARTS, MAX_DEPTH = 1_000_000, 32
+MAX_SHARED = 4  # tensors that may share their numbers, as targets of networks do
+PLAIN = {
+    *(torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+}
 # Raw simulator states, which may hold anything once a world diverges.
 RAW = frozenset({"nstep"})
 
@@ -101,13 +106,20 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
         raise ValueError(words.splitlines()[0]) from error
     if isinstance(content, dict) and content.get("sealed") is True and not has_seal:
         raise ValueError("its seal is missing: it is damaged")
-    tensors = [part for part in _parts(content) if isinstance(part, Tensor)]
-    # a view may claim more than the file holds
-    if (size := sum(t.numel() * t.element_size() for t in tensors)) > MAX_BYTES:
-        raise ValueError(f"its tensors claim {size >> 20} MiB")
-    if any(t.layout != torch.strided or t.is_meta or t.is_quantized for t in tensors):
-        raise ValueError("it holds a tensor that is not plain")
+    _check_tensors(content, stored=path.stat().st_size)
     return content
+
+
+def _check_tensors(content: Any, *, stored: int) -> None:
+    tensors = [part for part in _parts(content) if isinstance(part, Tensor)]
+    if any(t.is_nested or t.dtype not in PLAIN or t.is_meta for t in tensors) or any(
+        t.layout != torch.strided for t in tensors
+    ):
+        raise ValueError("it holds a tensor that is not plain")
+    # a view may claim more than the file holds, which comparing makes true
+    size = sum(t.numel() * t.element_size() for t in tensors)
+    if size > MAX_BYTES or size > RATIO_FROM + MAX_SHARED * stored:
+        raise ValueError(f"its tensors claim {size >> 20} MiB")
 
 
 def _check_seal(file: BinaryIO) -> bool:

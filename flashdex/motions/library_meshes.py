@@ -74,13 +74,13 @@ def read_mesh(path: Path, data: str, name: str, sha256: str) -> Mesh:
             return _parse_obj(text.decode("ascii"))
     except FileNotFoundError:
         fault = "is missing"
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         fault = f"cannot be read ({error})"
     raise LibraryError(f"{file}: {fault}. {AGAIN}")
 
 
 def _parse_obj(text: str) -> Mesh:
-    lines = [line.split() for line in text.splitlines()]
+    lines = [words for line in text.splitlines() if (words := line.split())]
     points = [words[1:4] for words in lines if words[:1] == ["v"]]
     corners = [words[1:4] for words in lines if words[:1] == ["f"]]
     vertices = np.array(points, np.float32).reshape(-1, 3)

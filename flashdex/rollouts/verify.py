@@ -25,7 +25,7 @@ from flashdex.rollouts.ledger import (
     ROLLOUTS,
     rollout_name,
 )
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import MAX_FILE, Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_files
@@ -264,7 +264,7 @@ class _RunCheck:
             if not new:
                 found.append(Finding(CONVERSIONS, f"{key} of {file}", OLD, False))
             elif other.is_file() or key in line:
-                sha = hash_content(other) if other.is_file() else None
+                sha = hash_content(other, most=MAX_FILE) if other.is_file() else None
                 pairs.append((key, line.get(key), sha))
         return found + [
             Finding(CONVERSIONS, f"{file}: {text.split(' ')[0]}", text)

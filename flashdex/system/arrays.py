@@ -133,10 +133,12 @@ def _differs(
     return ""
 
 
-def hash_content(path: Path) -> str:
-    """SHA-256 of a file, read now."""
+def hash_content(path: Path, *, most: int | None = None) -> str:
+    """SHA-256 of a file, read now; empty for one of more than ``most`` bytes."""
     digest = hashlib.sha256()
     with open_plain(path) as file:
+        if most is not None and os.fstat(file.fileno()).st_size > most:
+            return ""
         try:
             while block := file.read(1 << 20):
                 digest.update(block)

@@ -151,6 +151,7 @@ MESHES = {
     "no-faces": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n",
     "face-outside": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 9\n",
     "face-zero": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 0 1 2\n",
+    "face-of-30-digits": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 " + b"9" * 30,
     "words": b"v a b c\nf 1 2 3\n",
     "short": b"v 1 2\nf 1 2 3\n",
     "binary": bytes(range(256)),

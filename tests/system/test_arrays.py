@@ -43,6 +43,13 @@ def test_an_array_of_holes_is_not_read(tmp_path, step):
         map_array(tmp_path, "a.npy", big)
 
 
+def test_what_is_too_large_has_no_hash(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert hash_content(tmp_path / "a", most=5) == hash_content(tmp_path / "a") != ""
+    os.truncate(tmp_path / "a", 1 << 40)
+    assert hash_content(tmp_path / "a", most=5) == ""
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[:-4])
 

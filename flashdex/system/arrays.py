@@ -107,7 +107,7 @@ def map_array(root: Path, name: str, entry: ArrayEntry) -> np.ndarray:
 
 
 def _holes(descriptor: int, size: int) -> int:
-    """Bytes of holes: a terabyte of them would be read for hours; a few are let pass."""
+    """Bytes of holes; a terabyte of them would be read for hours."""
     total, at = 0, 0
     while hasattr(os, "SEEK_HOLE") and at < size and total <= MAX_HOLES:
         start = os.lseek(descriptor, at, os.SEEK_HOLE)

@@ -182,7 +182,7 @@ def _build(cls: type, data: Any, path: str, problems: list[str]) -> Any:
                     problems.append(f"{where}: {problem}")
                 noted.add(where)
                 _replace(cls, root, error)
-            # each name is compared with all known ones, which takes minutes of thousands
+            # each name is compared with all known ones: minutes for thousands
             for error in errors[MAX_PROBLEMS:]:
                 _replace(cls, root, error)
             if len(errors) > MAX_PROBLEMS:

@@ -121,8 +121,11 @@ def _measure(text: str) -> None:
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        is_plain = isinstance(event, yaml.ScalarEvent) and event.style in (None, "")
-        if is_plain and len(event.value) > MAX_PLAIN:
+        if (
+            isinstance(event, yaml.ScalarEvent)
+            and event.style in (None, "")
+            and len(event.value) > MAX_PLAIN
+        ):
             raise _fault(event, f"over {MAX_PLAIN} letters without quotes")
         if depth > MAX_DEPTH:
             raise _fault(event, f"nested more than {MAX_DEPTH} levels deep")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import pickle
 import re
 import zipfile
@@ -17,10 +16,12 @@ import numpy as np
 
 from flashdex.datasets.pickles import MAX_BYTES, RefusedError, unpickle
 from flashdex.errors import DemoError, is_of_machine
-from flashdex.system.archives import check_sizes, read_array
+from flashdex.system.archives import open_archive, read_array
+from flashdex.system.jsonl import parse_json
+from flashdex.system.pickled import check_tensors
 
 POINTER_START = b"version https://git-lfs"
-MAX_TEXT = 256 << 20  # bytes of a text file
+MAX_TEXT = 64 << 20  # bytes of a text file; lines and cells take fifty times as much
 POINTER_SIZE = 200  # bytes; a pointer holds three short lines
 # what is raised by content of another layout, or nested too deep
 BROKEN = (
@@ -98,7 +99,7 @@ def told(where: Path | str, fault: str, *, code: str | None = None) -> Iterator[
 def read_json(file: Path, fault: str, *, code: str | None = None) -> Any:
     """The content of a JSON file; ``fault`` says of another file what it is not."""
     with told(file, fault, code=code):
-        return json.loads(read_text(file))
+        return parse_json(read_bytes(file, most=MAX_TEXT))
 
 
 def read_text(file: Path) -> str:
@@ -121,9 +122,8 @@ def load_pickle(path: Path) -> Any:
 
 def load_npy(path: Path) -> Any:
     """The array of a ``.npy`` file, or the only element of one without dimensions."""
-    return _open(
-        path, ".npy array", lambda file: read_array(file.read(), unpickle=unpickle)
-    )
+    size = path.stat().st_size if path.is_file() else 0
+    return _open(path, ".npy array", partial(read_array, size=size, unpickle=unpickle))
 
 
 def load_npz(
@@ -180,26 +180,25 @@ def _open(path: Path, kind: str, read: Callable[[IO[bytes]], Any]) -> Any:
 
 
 def _read_npz(file: IO[bytes], only: Collection[str] | None) -> dict[str, Any]:
-    with zipfile.ZipFile(file) as archive:
-        check_sizes(archive, limit=MAX_BYTES)
+    with open_archive(file, limit=MAX_BYTES) as archive:
         files = [name for name in archive.namelist() if name.endswith(".npy")]
         if not files:
             raise ValueError("it holds no .npy entries")
         names = {name.removesuffix(".npy"): name for name in files}
         wanted = {k: v for k, v in names.items() if only is None or k in only}
-        return {
-            key: read_array(archive.read(name), unpickle=unpickle)
-            for key, name in wanted.items()
-        }
+        return {k: _read_member(archive, name) for k, name in wanted.items()}
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> Any:
+    with archive.open(name) as file:
+        size = archive.getinfo(name).file_size
+        return read_array(file, size, unpickle=unpickle)
 
 
 def _read_torch(file: IO[bytes]) -> Any:
     import torch  # slow to import, and few readers need it
 
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            check_sizes(archive, limit=MAX_BYTES)
-    file.seek(0)
+    check_tensors(file, limit=MAX_BYTES)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:

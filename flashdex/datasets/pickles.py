@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import pickletools
 import re
 import struct
 import sys
@@ -24,38 +23,17 @@ from typing import IO, Any
 import numpy as np
 import scipy.sparse as sp
 
+from flashdex.system.pickled import HASHED, MAGIC, check_room, check_steps
+
 MAX_BYTES = 2 << 30  # of a file, and of what it becomes
 # What a file may become: a small one anything up to LEAST_ROOM, a larger one GROWTH
 # times its size up to MOST_GROWN; beyond that, twice its size.
 LEAST_ROOM, GROWTH, MOST_GROWN = 64 << 20, 32, 512 << 20
-# bytes that a step of the pickle machine takes at least, and an item of a set or table
-STEP, HASHED = 32, 48
-STEPS = {
-    **dict.fromkeys(("REDUCE", "NEWOBJ", "NEWOBJ_EX", "OBJ", "INST"), 200),
-    **dict.fromkeys(("EMPTY_SET", "FROZENSET"), 216),
-    **dict.fromkeys(("EMPTY_DICT", "DICT", "EMPTY_LIST", "LIST", "TUPLE"), 64),
-    **dict.fromkeys(("MARK", "PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE", "GET"), 8),
-    **dict.fromkeys(("BINGET", "LONG_BINGET", "DUP", "POP", "APPEND", "APPENDS"), 8),
-}
-MAX_STEPS = 20_000_000  # of the pickle machine, some seconds
-MAX_INT = 2**64  # of a number that is no magic
-MAX_HASHED = 200_000_000  # parts of keys, some seconds
-TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3")
-HASHING = ("SETITEM", "SETITEMS", "DICT", "ADDITEMS", "FROZENSET")
-# of each step: items it takes, whether all down to a mark as well, items it leaves
-STACK = {
-    code.name: (
-        [*code.stack_before, pickletools.markobject].index(pickletools.markobject),
-        pickletools.markobject in code.stack_before,
-        len(code.stack_after),
-    )
-    for code in pickletools.opcodes
-}
 MAX_PARTS = 50_000_000  # of the containers of a file
 
 DTYPE_CODE = re.compile(r"[|<>=]?(b1|[iu][1248]|f[248]|c8|c16|O[48]?|[SU]\d{1,6})")
-# what an old torch file begins with, its version, and the storages it may hold
-MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001
+# what an old torch file begins with (and ``MAGIC``), and the storages it may hold
+VERSION = 1001
 STORAGES = {
     **{"DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16"},
     **{"BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32"},
@@ -104,7 +82,7 @@ def _stand_in(make: Callable[[tuple, Any, int], Any]) -> type[StandIn]:
 def _encoded(args: tuple, state: Any, room: int) -> bytes:
     if args[1] not in ("latin1", "latin-1"):
         raise ValueError(f"bytes in the encoding {args[1]!r}")
-    _check_room(len(args[0]), room)
+    check_room(len(args[0]), room)
     return args[0].encode("latin1")
 
 
@@ -132,18 +110,13 @@ def _dtype(args: tuple, state: Any, room: int) -> np.dtype:
     return np.dtype("O" if code.startswith("O") else code).newbyteorder(order)
 
 
-def _check_room(size: int, room: int) -> None:
-    if size > room:
-        raise ValueError("it becomes far more than the file holds")
-
-
 def _make_array(shape: Any, dtype: Any, order: Any, data: Any, room: int) -> np.ndarray:
     """An array of checked size; nothing is allocated beyond the data at hand."""
     shape = check_sizes(shape)
     if not isinstance(dtype, np.dtype) or order not in ("C", "F"):
         raise ValueError("an array without type or order")
     count = math.prod(shape)
-    _check_room(count * dtype.itemsize, room)
+    check_room(count * dtype.itemsize, room)
     if dtype.hasobject:
         if not isinstance(data, list) or len(data) != count:
             raise ValueError(f"an array of shape {shape} without that many objects")
@@ -172,7 +145,7 @@ def _chumpy_select(args: tuple, state: Any, room: int) -> np.ndarray:
     """Elements of an array, in a new shape."""
     flat = np.asarray(state["a"]).ravel()
     places = np.asarray(state["idxs"], dtype=np.int64)
-    _check_room(places.size * flat.itemsize, room)
+    check_room(places.size * flat.itemsize, room)
     return flat[places].reshape(check_sizes(state["preferred_shape"]))
 
 
@@ -206,7 +179,7 @@ def _storage(args: tuple, state: Any, room: int) -> Any:
     """
     import torch  # slow to import, and few readers need it
 
-    _check_room(len(args[0]), room)
+    check_room(len(args[0]), room)
     file = io.BytesIO(_bytes(args[0]))
     magic, version, system, storage, keys = (_load(file, _Head) for _ in range(5))
     kind, name, key, _, length = storage[:5]
@@ -237,12 +210,12 @@ def _tensor(args: tuple, state: Any, room: int) -> Any:
     count = math.prod(sizes)
     if count and last >= flat.numel():
         raise ValueError(f"a tensor of shape {sizes} that leaves its storage")
-    _check_room(count * flat.element_size(), room)
+    check_room(count * flat.element_size(), room)
     return flat.as_strided(sizes, strides, offset if count else 0).clone()
 
 
 def _counted(room: int, items: Any = ()) -> Any:
-    _check_room(HASHED * len(items), room)
+    check_room(HASHED * len(items), room)
     return items
 
 
@@ -308,68 +281,9 @@ class _Head(_Unpickler):
         return pid
 
 
-class _Forecast:
-    """What a pickle will take, followed without building it: memory, and hashing.
-
-    A tuple has no hash of its own: it is taken of all its parts, each time anew. Tuples
-    of the same tuples double it with every level, a hundred bytes of file never end.
-    """
-
-    def __init__(self, room: int) -> None:
-        self.room, self.hashed = room, 0  # bytes; parts of keys
-        self._stack: list[int] = []  # parts of each item; 0 is a mark
-        self._memo: dict[int, int] = {}
-
-    def add(self, name: str, part: Any, place: int) -> None:
-        """Take in one step; ``place`` of the memo is the next that is free."""
-        stack = self._stack
-        self.room -= STEPS.get(name, STEP)
-        if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
-            self._memo[place if name == "MEMOIZE" else part] = stack[-1] if stack else 1
-        elif name in ("GET", "BINGET", "LONG_BINGET"):
-            stack.append(self._memo.get(part, 1))
-        elif name in ("MARK", "DUP"):
-            stack.append(0 if name == "MARK" or not stack else stack[-1])
-        else:
-            self._apply(name, *STACK[name])
-        _check_room(0, self.room)
-
-    def _apply(self, name: str, alone: int, to_mark: bool, left: int) -> None:
-        stack, taken, depth = self._stack, 0, len(self._stack)
-        while to_mark and stack and (item := stack.pop()):
-            taken += item
-        if alone:
-            taken += sum(stack[-alone:])
-            del stack[-alone:]
-        if name in HASHING:
-            self.room -= HASHED * (depth - len(stack))
-            self.hashed += taken
-            if self.hashed > MAX_HASHED:
-                raise pickle.UnpicklingError("keys that would take hours to compare")
-        if left:
-            stack += [1 + taken if name in TUPLES else 1] * left
-
-
 def _load(file: IO[bytes], kind: type[pickle.Unpickler] = _Unpickler) -> Any:
-    """One pickle, read over once from its start to its end before it builds anything.
-
-    The pickle machine itself allocates whatever a length or a place in its memo says,
-    tens of gigabytes for ten bytes of file; after this check both are true.
-    """
-    start, puts, forecast = file.tell(), 0, _Forecast(_room(file))
-    for number, (code, part, _) in enumerate(pickletools.genops(file)):
-        forecast.add(code.name, part, puts)
-        if number > MAX_STEPS:
-            raise pickle.UnpicklingError(f"more than {MAX_STEPS:,} steps")
-        if code.name in ("PUT", "BINPUT", "LONG_BINPUT"):
-            if not isinstance(part, int) or part > puts:
-                raise pickle.UnpicklingError("the memo of the pickle is not in order")
-            puts += 1
-        elif code.name == "MEMOIZE":
-            puts += 1
-        elif isinstance(part, int) and abs(part) > MAX_INT and part != MAGIC:
-            # keys of one hash, and text of it, take time that grows with the square
-            raise pickle.UnpicklingError("a number of more than 64 bits")
+    start = file.tell()
+    check_steps(file, room=_room(file))
     file.seek(start)
     return kind(file, encoding="latin1").load()
 
@@ -410,7 +324,7 @@ def unpickle(file: IO[bytes]) -> Any:
             made = done[key] = _convert(item, plain, lambda: room)
             # one part of the file may be asked for in many forms, each a copy
             room -= getattr(made, "nbytes", 0) or sys.getsizeof(made)
-            _check_room(0, room)
+            check_room(0, room)
             if length := len(made) if isinstance(made, (*CONTAINERS, dict)) else 0:
                 inner = made.values() if isinstance(made, dict) else made
                 parts[id(made)] = length + sum(parts.get(id(i), 0) for i in inner)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -77,13 +78,16 @@ def listed_below(folder: Path, name: str) -> list[Path]:
 
 
 def on_disk(file: Path) -> Path:
-    """A file as it is called on the disk, where only the case of its name differs."""
+    """A file as the disk calls it, where case or the form of its accents differs."""
     if file.exists():
         return file
-    same = [
-        f for f in listed(file.parent, "*") if f.name.casefold() == file.name.casefold()
-    ]
+    name = _alike(file.name)
+    same = [f for f in listed(file.parent, "*") if _alike(f.name) == name]
     return same[0] if len(same) == 1 else file
+
+
+def _alike(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def relative(file: Path, root: Path) -> str:

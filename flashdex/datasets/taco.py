@@ -11,6 +11,7 @@ metres. The origin lies somewhere below the table, so no height is claimed.
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 from collections import Counter
@@ -44,6 +45,7 @@ FPS = 30.0
 HANDS, OBJECTS = "Hand_Poses", "Object_Poses"
 ROLES = ("tool", "target")
 MESH_SCALE = 0.01  # centimetres to metres
+MAX_TRACK = 1 << 28  # bytes of a track; an hour has 14 million
 MAX_TRIM = 2  # frames by which tracks of a sequence may differ in length
 
 
@@ -195,7 +197,9 @@ def _read_object(sequence: TacoSequence, role: str, notes: list[str]) -> DemoObj
 def _load_matrices(file: Path) -> np.ndarray:
     fault = "not a .npy of (T, 4, 4) floats; pickled arrays are not read"
     with told(file, fault, code="E_KEYS"):
-        return numbers(read_array(read_bytes(file)), what=f"{file}: (T, 4, 4)")
+        data = read_bytes(file, most=MAX_TRACK)
+        stored = read_array(io.BytesIO(data), len(data))
+        return numbers(stored, what=f"{file}: (T, 4, 4)")
 
 
 def _common_length(

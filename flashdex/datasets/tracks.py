@@ -131,8 +131,13 @@ def blank_fillers(track: np.ndarray) -> np.ndarray:
 
     Data sets write zeros, or -1, or another number, where nothing was tracked: a frame
     of poses (T, 7), transforms (T, 4, 4) or keypoints (T, 21, 3) whose entries are all
-    the same, or whose quaternion is zero. Tracks of other shapes stay as they are.
+    the same, or whose quaternion is zero; and a single joint or tip of such entries (a
+    wrist may be the origin of a hand's own frame). Other shapes stay as they are.
     """
+    if track.ndim == 3 and track.shape[2] == 3 and track.size:
+        single = np.ptp(track, axis=2) < MARK_SPREAD
+        single[:, 0] = single[:, 1:].all(axis=1)
+        return np.where(single[..., None], np.nan, track) if single.any() else track
     if track.ndim == 3 and track.size:
         spread = np.ptp(track, axis=(1, 2))
     elif track.ndim == 2 and track.shape[1] == 7 and len(track):

@@ -40,6 +40,7 @@ from flashdex.system.files import own_file
 Arrays = Mapping[str, np.ndarray]
 CHECK_VERSION = 2  # raise when a library is checked for more
 MAX_MARKS = 1000  # libraries that are remembered
+MAX_FAULTS = 100  # that are told; a library of more is another one
 
 
 def _changes(path: Path, manifest: Manifest, arrays: Arrays) -> Iterator[str]:
@@ -128,7 +129,9 @@ def check_all(path: Path, manifest: Manifest, arrays: Arrays) -> list[str]:
             try:
                 # one by one: what was found before an error counts
                 for fault in look:
-                    faults.append(fault)  # noqa: PERF402
+                    faults.append(fault)
+                    if len(faults) >= MAX_FAULTS:
+                        return [*faults, "and no more was looked at"]
             except (LibraryError, OSError) as error:
                 faults.append(str(error))
     return faults

@@ -16,8 +16,8 @@ from flashdex.objects.asset import ObjectAsset
 from flashdex.system.files import open_plain, own_file
 from flashdex.system.names import file_stem
 
-MAX_MESH = 64 << 20  # bytes
-MAX_FACES = 20_000  # a visual mesh has 5,000, a convex part twice its vertices
+MAX_MESH = 8 << 20  # bytes; a visual mesh has 5,000 triangles, 0.3 million bytes
+MAX_FACES = 20_000  # a convex part has twice its vertices
 Mesh = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
@@ -84,11 +84,8 @@ def _parse_obj(text: str) -> Mesh:
     lines = text.splitlines()
     if (count := sum(line.startswith("f ") for line in lines)) > MAX_FACES:
         raise ValueError(f"it has {count} triangles, {MAX_FACES} are allowed")
-    vertices, faces = (
-        np.array(_words(lines, kind), number).reshape(-1, 3)
-        for kind, number in (("v ", np.float32), ("f ", np.int64))
-    )
-    faces -= 1
+    vertices = np.array(_words(lines, "v "), np.float32).reshape(-1, 3)
+    faces = np.array(_words(lines, "f "), np.int64).reshape(-1, 3) - 1
     if not np.isfinite(vertices).all() or len(vertices) < 4 or len(faces) < 1:
         raise ValueError("it has no body, or numbers that are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):

@@ -46,6 +46,7 @@ NO_NAME, NAME_LENGTH = re.compile(r"[^\w @+.()-]+"), 60
 # folders of a library's data, the one that is being written too
 DATA = re.compile(r"\.?data-[0-9a-f]{16}")
 TEMPORARY = re.compile(r"\.(manifest\.json|report\.html)\.\d+\.tmp")
+OF_THE_DISK = (".DS_Store", "Thumbs.db", "lost+found")  # a folder is empty all the same
 LOCK, REPORT, PAGE = ".library.lock", "report.csv", "report.html"
 # what schema 1 kept beside its manifest
 OLD_PARTS = ("frames", "motions", "objects", "quality", "meshes")
@@ -246,6 +247,12 @@ def check_target(path: Path) -> None:
     """
     if "\0" in str(path):
         raise LibraryError(f"{str(path)!a}: cannot be a path.")
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:  # a name that is too long
+        raise LibraryError(f"{path}: cannot be a path ({error.strerror}).") from error
     folder = path
     while not os.path.lexists(folder) and folder != folder.parent:
         folder = folder.parent
@@ -263,7 +270,7 @@ def check_target(path: Path) -> None:
         with as_library_error(hint=""):
             for name in (REPORT, PAGE):
                 own_file(path, name)
-        held = [n for n in os.listdir(path) if n != LOCK]
+        held = [n for n in os.listdir(path) if n not in (LOCK, *OF_THE_DISK)]
         ours = [n for n in held if DATA.fullmatch(n) or TEMPORARY.fullmatch(n)]
         if len(ours) < len(held) and not _is_library(path):
             raise LibraryError(

@@ -8,7 +8,6 @@ and a reader gets the bytes alone, without the folder that they come from.
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import struct
@@ -17,11 +16,16 @@ from typing import Any
 
 import trimesh
 
+from flashdex.system.jsonl import parse_json
+
 # others of trimesh unpack archives, or read what they name from other files
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
 MAX_FACES = 5_000_000  # a scene may hold the same geometry any number of times
 MAX_REPEATED = 500_000  # as small as the file may be, cleaning takes its time
 MAX_FILE = 1 << 29  # bytes; text takes three times as much while it is parsed
+# lines of text, of bytes each: five million triangles have nine million, a polygon of
+# ten thousand corners one; those take twenty seconds, and larger ones never end
+MAX_LINES, MAX_LINE = 12_000_000, 1 << 17
 MAX_NODES, MAX_DEPTH = 10_000, 64  # of a scene
 MAX_GROUPS = 1000  # of triangles, each a mesh of its own; time grows with the square
 # bytes of an entry, at most; what a glb unpacks to below MIN_GROWTH is let pass
@@ -46,12 +50,16 @@ def read_scene(path: Path) -> trimesh.Scene:
             raise ValueError(f"more than {MAX_FILE >> 20} MiB")
         data = file.read()
     kind = path.suffix.lower().removeprefix(".")
+    if kind != "glb" and (count := data.count(b"\n")) > MAX_LINES:
+        raise ValueError(f"{count} lines; at most {MAX_LINES}")
     if kind == "ply":
         _check_ply(data)
     elif kind == "glb":
         _check_glb(data)
-    elif kind == "obj" and data.count(b"usemtl") > MAX_GROUPS:
-        data = MATERIAL.sub(b"", data)
+    elif kind in ("obj", "off"):
+        _check_lines(data)
+        if data.count(b"usemtl") > MAX_GROUPS:
+            data = MATERIAL.sub(b"", data)
     elif kind == "stl" and data.count(b"endsolid") > MAX_GROUPS:
         raise ValueError(f"more than {MAX_GROUPS} solids; join them to one")
     scene = trimesh.load_scene(
@@ -67,6 +75,16 @@ def read_scene(path: Path) -> trimesh.Scene:
     return scene
 
 
+def _check_lines(data: bytes) -> None:
+    start = 0
+    while start + MAX_LINE < len(data):
+        end = max(data.rfind(mark, start, start + MAX_LINE) for mark in b"\n\r")
+        # a backslash at its end joins a line with the next
+        if end < 0 or data.count(b"\\\n", start, end + 2) > MAX_GROUPS:
+            raise ValueError(f"a line of more than {MAX_LINE >> 10} KiB")
+        start = end + 1
+
+
 def _check_ply(data: bytes) -> None:
     head = data[:PLY_HEAD].partition(b"end_header")[0]
     counts = [int(count) for count in PLY_ELEMENT.findall(head)]
@@ -78,11 +96,13 @@ def _check_glb(data: bytes) -> None:
     (length,) = struct.unpack_from("<I", data, 12)
     if 20 + length > len(data):
         raise ValueError("it ends in its head")
-    scene = json.loads(data[20 : 20 + length])
+    scene = parse_json(data[20 : 20 + length])
     if any("uri" in buffer for buffer in scene.get("buffers", [])):
         raise ValueError("its numbers are in another file")
     total = 0
     for accessor in scene.get("accessors", []):
+        if int(accessor["count"]) < 0:  # would make up for the others
+            raise ValueError(f"{accessor['count']} numbers announced")
         total += int(accessor["count"]) * GLB_BYTES.get(accessor["type"], 64)
         # without a view it is filled with zeros, as many as it says
         if "bufferView" not in accessor and int(accessor["count"]) * 16 > len(data):

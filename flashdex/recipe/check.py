@@ -28,6 +28,7 @@ from flashdex.recipe.tasks import split_foreign
 
 R = TypeVar("R", bound=RunRecipe)
 _NAME_BYTES, _PATH_BYTES = 100, 2000
+MAX_PROBLEMS = 10  # of one look at a recipe that are told
 # Stand-ins for required values that are absent; the recipe is refused anyway.
 _STAND_INS: dict[type, Any] = {int: 1, str: "", float: 1.0}
 _EXPECTED = {
@@ -201,12 +202,20 @@ def build_config(cls: type, data: Any, path: str, problems: list[str]) -> Any:
         except ValidationError as found:
             if not found.errors()[0]["loc"]:
                 raise RecipeError([f"{path}: a text in it is not Unicode"]) from found
-            for error in found.errors():
+            errors = found.errors()
+            for error in errors[:MAX_PROBLEMS]:
                 where, problem = _explain(cls, error, path)
                 if where not in noted:
                     problems.append(f"{where}: {problem}")
                 noted.add(where)
                 _replace(cls, root, error)
+            # each name is compared with all known ones: minutes for thousands
+            for error in errors[MAX_PROBLEMS:]:
+                _replace(cls, root, error)
+            if len(errors) > MAX_PROBLEMS:
+                problems.append(
+                    f"{path}: {len(errors) - MAX_PROBLEMS} more of this kind"
+                )
     raise RecipeError(problems)  # a required value has no stand-in
 
 

@@ -181,7 +181,8 @@ def merge(below: Any, above: Any) -> Any:
         mine = below if isinstance(below, Mapping) else {}
         kept = {key: merge(None, mine[key]) for key in mine if key not in above}
         both = {key: merge(mine.get(key), value) for key, value in above.items()}
-        return {key: (kept | both)[key] for key in (*mine, *both)}
+        merged = kept | both
+        return {key: merged[key] for key in (*mine, *both)}
     return [merge(None, item) for item in above] if isinstance(above, list) else above
 
 

@@ -21,6 +21,8 @@ from flashdex.errors import RecipeError
 MAX_BYTES = 2**20
 MAX_DEPTH = 24
 MAX_VALUES = 50_000
+MAX_PLAIN = 4096  # letters without quotes: of a number, each costs more than the last
+MAX_INT = 2**64
 _PLAIN = (dict, list, str, int, float, bool, type(None))
 
 
@@ -119,6 +121,12 @@ def _measure(text: str) -> None:
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
+        if (
+            isinstance(event, yaml.ScalarEvent)
+            and event.style in (None, "")
+            and len(event.value) > MAX_PLAIN
+        ):
+            raise _fault(event, f"over {MAX_PLAIN} letters without quotes")
         if depth > MAX_DEPTH:
             raise _fault(event, f"nested more than {MAX_DEPTH} levels deep")
         if count > 2 * MAX_VALUES:
@@ -131,6 +139,8 @@ def _check_values(data: Any, where: str) -> None:
         if not isinstance(value, _PLAIN):
             kind = type(value).__name__
             raise RecipeError([f"a value of type {kind} is not allowed"], where=where)
+        if isinstance(value, int) and abs(value) > MAX_INT:  # no float, and no text
+            raise RecipeError(["a number of more than 64 bits"], where=where)
         if count > MAX_VALUES or depth > MAX_DEPTH:
             problem = f"unfolds to more than {MAX_VALUES} values or {MAX_DEPTH} levels"
             raise RecipeError([problem], where=where)

@@ -19,7 +19,7 @@ from flashdex.metrics.criteria import (
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.rollouts.certificate import PROVEN, certify
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.rollout import Rollout, limits_of
+from flashdex.rollouts.rollout import MAX_FILE, Rollout, limits_of
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder, remove_own
 from flashdex.system.jsonl import append_line, check_keys, drop_cut_line, read_lines
@@ -193,7 +193,9 @@ class Ledger(Tally):
         self, name: str, path: Path, line: dict[str, Any] | None, wall_s: float
     ) -> bool:
         """Write the line of one stored rollout, unless it has one."""
-        if line is not None and line.get("rollout_sha256") == hash_content(path):
+        if line is not None and line.get("rollout_sha256") == hash_content(
+            path, most=MAX_FILE
+        ):
             return False
         try:
             rollout = Rollout.load(path)

@@ -31,6 +31,7 @@ from flashdex.system.names import check_name
 ROLLOUT_SCHEMA = 1
 REFERENCE = ("ref_object_pos", "ref_object_quat", "ref_fingertips", "ref_joints")
 MAX_BYTES = 256 << 20  # of the arrays of a file; a minute of two hands has 20 MB
+MAX_FILE = 2 * MAX_BYTES  # bytes of the file, packed as badly as may be
 _WHOLE = ("hand_active", "hand_object", "object_qpos_adr", "object_qvel_adr")
 MAX_FPS, MAX_DECIMATION = 1000, 1000
 # JSON fields and what they hold

@@ -24,7 +24,7 @@ from flashdex.rollouts.ledger import (
     ROLLOUTS,
     rollout_name,
 )
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import MAX_FILE, Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_files
@@ -265,7 +265,11 @@ class _RunCheck:
             ("verdict", line.get("verdict"), verdict),
             ("certified", line["certified"], verdict in PROVEN if verdict else None),
             *(
-                (key, line.get(key), hash_content(other) if other.is_file() else None)
+                (
+                    key,
+                    line.get(key),
+                    hash_content(other, most=MAX_FILE) if other.is_file() else None,
+                )
                 for key, other in hashes.items()
             ),
         ]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,14 +20,52 @@ MAX_MEMBERS = 100_000
 # plain arrays hardly shrink further; small ones may, as masks of zeros do
 MAX_RATIO, RATIO_FROM = 200, 64 << 20
 MAX_HEADER = 10_000  # bytes of a .npy header; numpy writes 118
+MAX_DIRECTORY = 32 << 20  # bytes of the list of members
+MAX_FILE = MAX_BYTES + (64 << 20)  # bytes of an archive, packed as badly as may be
+BLOCK = 1 << 20  # bytes that are unpacked at a time
+# the records at the end of an archive that say how long its list is, overlapping ones
+# too: zipfile believes the last one; an old one of all ones leaves it to the newer
+END_BYTES = (1 << 16) + 22 + 20 + 56
+END = re.compile(rb"(?=PK\x05\x06.{8}(.{4})|PK\x06\x06.{36}(.{8}))", re.DOTALL)
+FULL = 0xFFFFFFFF
 
 
-def check_sizes(archive: zipfile.ZipFile, *, limit: int = MAX_BYTES) -> None:
-    """Refuse an archive that unpacks to more than ``limit`` bytes, before it does.
+def open_archive(file: Path | IO[bytes], *, limit: int = MAX_BYTES) -> zipfile.ZipFile:
+    """Open an archive that unpacks to no more than ``limit`` bytes.
 
     Raises:
         ValueError: it does, or it grows as no archive of data does.
+        Exception: zipfile and zlib raise nearly any on damaged bytes.
     """
+    if isinstance(file, Path):
+        with file.open("rb") as stream:
+            _check_directory(stream)
+    else:
+        _check_directory(file)
+    archive = zipfile.ZipFile(file)
+    try:
+        _check_sizes(archive, limit)
+    except ValueError:
+        archive.close()
+        raise
+    return archive
+
+
+def _check_directory(file: IO[bytes]) -> None:
+    """Refuse a list of members that fills the memory while it is read: ten times it.
+
+    ``zipfile`` believes its length, wherever it stands, and not its count.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - END_BYTES))
+    tail = file.read(END_BYTES)
+    file.seek(0)
+    lengths = [int.from_bytes(a or b, "little") for a, b in END.findall(tail)]
+    if any(n > MAX_DIRECTORY for n in lengths if n != FULL) or size > MAX_FILE:
+        raise ValueError(f"its list of files is larger than {MAX_DIRECTORY >> 20} MiB")
+
+
+def _check_sizes(archive: zipfile.ZipFile, limit: int) -> None:
     members = archive.infolist()
     size = sum(member.file_size for member in members)
     stored = sum(member.compress_size for member in members)
@@ -49,8 +89,7 @@ def check_archive(file: Path | IO[bytes], *, limit: int = MAX_BYTES) -> None:
         ValueError: it is no archive, too large, or damaged.
     """
     try:
-        with zipfile.ZipFile(file) as archive:
-            check_sizes(archive, limit=limit)
+        with open_archive(file, limit=limit) as archive:
             damaged = archive.testzip()
     # damaged bytes make zipfile and zlib raise nearly any exception
     except Exception as error:
@@ -69,51 +108,60 @@ def read_npz(path: Path, *, limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
         ValueError: it is something else, too large, damaged, or holds objects.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            check_sizes(archive, limit=limit)
+        with open_archive(path, limit=limit) as archive:
             names = archive.namelist()
             odd = [name for name in names if not name.endswith(".npy")]
             if odd or len(set(names)) != len(names) or not names:
                 raise ValueError(f"not an archive of arrays: {odd[:1] or names[:1]}")
-            # reading to the end compares the checksum
-            content = {n.removesuffix(".npy"): archive.read(n) for n in names}
+            return {n.removesuffix(".npy"): _read_member(archive, n) for n in names}
     except Exception as error:
         if isinstance(error, OSError | ValueError) or is_of_machine(error):
             raise
         raise ValueError(f"not a whole archive ({error})") from error
-    arrays = {}
-    for name, data in content.items():
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name) as file:
         try:
-            arrays[name] = read_array(data)
+            return read_array(file, archive.getinfo(name).file_size)
         except ValueError as error:
-            raise ValueError(f"'{name}': {error}") from error
-    return arrays
+            key = name.removesuffix(".npy")
+            raise ValueError(f"'{key}': {error}") from error
 
 
 def read_array(
-    data: bytes, *, unpickle: Callable[[IO[bytes]], Any] | None = None
+    file: IO[bytes], size: int, *, unpickle: Callable[[IO[bytes]], Any] | None = None
 ) -> Any:
-    """The array of the bytes of a ``.npy``; its own memory, nothing beyond the data.
+    """The array of a ``.npy`` of ``size`` bytes, in memory of its own, but once.
 
     Args:
-        data: of the file.
+        file: at its beginning.
+        size: of the file.
         unpickle: reads an array of objects; the only one of it, where it has no axes.
 
     Raises:
         ValueError: damaged, of objects without ``unpickle``, or its shape does not fit
             to the bytes.
     """
-    file = io.BytesIO(data)
     shape, by_columns, dtype = read_header(file, objects=unpickle is not None)
     if unpickle is not None and dtype.kind == "O":
-        array = unpickle(file)
+        array = unpickle(io.BytesIO(file.read()))
         if not isinstance(array, np.ndarray) or array.dtype.kind != "O":
             raise ValueError("an object array that holds something else")
         return array.item() if array.ndim == 0 else array
-    count, start = math.prod(shape), file.tell()
-    if count * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{shape} of {dtype} does not fit to {len(data)} bytes")
-    flat = np.frombuffer(bytearray(memoryview(data)[start:]), dtype, count)
+    count, rest = math.prod(shape), size - file.tell()
+    if count * dtype.itemsize != rest:
+        raise ValueError(f"{shape} of {dtype} does not fit to {size} bytes")
+    data, at = bytearray(rest), 0
+    # reading to the end compares the checksum of an archive
+    while part := file.read(BLOCK):
+        if at + len(part) > rest:
+            raise ValueError(f"more than {size} bytes")
+        data[at : at + len(part)] = part
+        at += len(part)
+    if at < rest:
+        raise ValueError(f"cut off after {at} of {rest} bytes")
+    flat = np.frombuffer(data, dtype, count)
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
@@ -121,6 +169,8 @@ def read_header(
     file: IO[bytes], *, objects: bool = False
 ) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, whether by columns, and type of a ``.npy``; the file stands at its data.
+
+    ``objects`` lets arrays of them pass, whose data are a pickle.
 
     Raises:
         ValueError: damaged, of nothing, with impossible sizes, or of objects where
@@ -130,7 +180,7 @@ def read_header(
         version = np.lib.format.read_magic(file)
         read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
         shape, by_columns, dtype = read(file, max_header_size=MAX_HEADER)
-    except ValueError:
+    except (ValueError, zipfile.BadZipFile):
         raise
     except MemoryError:  # Python's parser says so of text that is too deep for it
         raise ValueError("its header is nested too deep") from None

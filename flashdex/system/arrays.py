@@ -16,6 +16,7 @@ from flashdex.errors import RunError
 from flashdex.system.archives import MAX_BYTES, read_header
 from flashdex.system.files import open_plain, own_file
 
+MAX_HOLES = 1 << 30  # bytes of an array that take no place on the disk
 KINDS = ("bool", "int32", "int64", "float32", "float64", "uint8")
 
 
@@ -92,6 +93,8 @@ def map_array(root: Path, name: str, entry: ArrayEntry) -> np.ndarray:
             shape, by_columns, dtype = read_header(file)
             start, size = file.tell(), os.fstat(file.fileno()).st_size
             fault = _differs(entry, shape, by_columns, dtype, size - start)
+            if not fault and _holes(file.fileno(), size) > MAX_HOLES:
+                fault = f"has holes of more than {MAX_HOLES >> 20} MiB on the disk"
             if not fault and entry.num_bytes == 0:
                 return np.empty(shape, dtype)
             if not fault:
@@ -101,6 +104,19 @@ def map_array(root: Path, name: str, entry: ArrayEntry) -> np.ndarray:
     except (OSError, ValueError) as error:
         fault = f"cannot be read ({error})"
     raise RunError(f"{path}: {fault}. It was damaged or changed.")
+
+
+def _holes(descriptor: int, size: int) -> int:
+    """Bytes of holes; a terabyte of them would be read for hours."""
+    total, at = 0, 0
+    while hasattr(os, "SEEK_HOLE") and at < size and total <= MAX_HOLES:
+        start = os.lseek(descriptor, at, os.SEEK_HOLE)
+        try:
+            at = os.lseek(descriptor, start, os.SEEK_DATA)
+        except OSError:  # to the end
+            at = size
+        total += at - start
+    return total
 
 
 def _differs(
@@ -117,10 +133,12 @@ def _differs(
     return ""
 
 
-def hash_content(path: Path) -> str:
-    """SHA-256 of a file, read now."""
+def hash_content(path: Path, *, most: int | None = None) -> str:
+    """SHA-256 of a file, read now; empty for one of more than ``most`` bytes."""
     digest = hashlib.sha256()
     with open_plain(path) as file:
+        if most is not None and os.fstat(file.fileno()).st_size > most:
+            return ""
         try:
             while block := file.read(1 << 20):
                 digest.update(block)

@@ -23,8 +23,29 @@ from flashdex.system.files import open_atomic, open_own, open_plain, read_own
 _LOG = logging.getLogger(__name__)
 SEAL = re.compile(rb', "sha256": "([0-9a-f]{64})"}\Z')
 SEAL_BYTES = 79  # of the end of a line that has one
+MAX_BYTES = 512 << 20  # of a file; a week of metrics has fifty million
+MAX_VALUES = 20_000_000  # of a text of JSON; they take 70 bytes each
 # key of a line -> the type its value has; float takes whole numbers as well
 Schema = Mapping[str, type | tuple[type, ...]]
+
+
+def parse_json(text: bytes) -> Any:
+    """The value of a text of JSON, of bounded count: brackets grow thirty times.
+
+    Raises:
+        ValueError: it is none, or too much, or too deep.
+    """
+    check_count(text)
+    try:
+        return json.loads(text.decode("utf-8"))
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def check_count(text: bytes) -> None:
+    """Refuse a text of JSON whose values would fill the memory, before it is parsed."""
+    if sum(text.count(mark) for mark in b"[{,") > MAX_VALUES:
+        raise ValueError(f"it holds more than {MAX_VALUES:,} values")
 
 
 def seal(text: str, before: str) -> str:
@@ -66,11 +87,17 @@ def read_lines(path: Path, schema: Schema | None = None) -> list[dict[str, Any]]
 def _read(path: Path) -> bytes:
     try:
         with open_plain(path) as file:
-            return file.read()
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:  # a hole on the disk may be of any size
+            raise RunError(f"{path}: larger than {MAX_BYTES >> 20} MiB. Restore it.")
+        check_count(content)
+        return content
     except FileNotFoundError:
         return b""
     except OSError as error:
         raise RunError(f"{path}: cannot be read ({error.strerror}).") from error
+    except ValueError as error:
+        raise RunError(f"{path}: cannot be read ({error}). Restore it.") from error
 
 
 def _whole(content: bytes) -> int:
@@ -84,8 +111,8 @@ def _whole(content: bytes) -> int:
 
 def _parse(path: Path, number: int, raw: bytes) -> dict[str, Any]:
     try:
-        line = json.loads(raw.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
+        line = parse_json(raw)
+    except ValueError as error:
         raise _fault(path, number, f"is not JSON ({error})") from error
     if not isinstance(line, dict):
         raise _fault(path, number, "is not a JSON object")
@@ -205,8 +232,8 @@ def read_object(root: Path, *parts: str, sealed: bool = True) -> dict[str, Any]:
         return {}
     path, text = root.joinpath(*parts), text.removesuffix("\n")
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        found = parse_json(text.encode("utf-8"))
+    except ValueError as error:
         raise RunError(f"{path}: not JSON ({error}). Restore or remove it.") from error
     if not isinstance(found, dict):
         raise RunError(f"{path}: not a JSON object. Restore or remove it.")

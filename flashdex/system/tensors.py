@@ -20,11 +20,18 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flashdex.errors import is_of_machine
-from flashdex.system.archives import MAX_BYTES, check_archive
+from flashdex.system.archives import MAX_BYTES, RATIO_FROM, check_archive
 from flashdex.system.files import open_own, open_plain, own_file
+from flashdex.system.pickled import check_tensors
 
 SEAL = re.compile(rb"sha256:([0-9a-f]{64})")
 SEAL_BYTES = 71
+MAX_PARTS, MAX_DEPTH = 1_000_000, 32
+MAX_SHARED = 4  # tensors that may share their numbers, as targets of networks do
+PLAIN = {
+    *(torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+}
 # Raw simulator states, which may hold anything once a world diverges.
 RAW = frozenset({"nstep"})
 
@@ -91,7 +98,7 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
                 raise ValueError("its seal is missing: damaged, or of another version")
             file.seek(0)
             check_archive(file)
-            file.seek(0)
+            check_tensors(file, limit=MAX_BYTES)
             content = torch.load(file, map_location="cpu", weights_only=True)
     # damaged bytes make torch raise nearly any exception
     except Exception as error:
@@ -101,9 +108,20 @@ def read_tensors(root: Path, *parts: str, sealed: bool = False) -> Any:
         raise ValueError(words.splitlines()[0]) from error
     if isinstance(content, dict) and content.get("sealed") is True and not has_seal:
         raise ValueError("its seal is missing: it is damaged")
-    if (size := _size(content)) > MAX_BYTES:
-        raise ValueError(f"its tensors claim {size >> 20} MiB")
+    _check_tensors(content, stored=path.stat().st_size)
     return content
+
+
+def _check_tensors(content: Any, *, stored: int) -> None:
+    tensors = [part for part in _parts(content) if isinstance(part, Tensor)]
+    if any(t.is_nested or t.dtype not in PLAIN or t.is_meta for t in tensors) or any(
+        t.layout != torch.strided for t in tensors
+    ):
+        raise ValueError("it holds a tensor that is not plain")
+    # a view may claim more than the file holds, which comparing makes true
+    size = sum(t.numel() * t.element_size() for t in tensors)
+    if size > MAX_BYTES or size > RATIO_FROM + MAX_SHARED * stored:
+        raise ValueError(f"its tensors claim {size >> 20} MiB")
 
 
 def _check_seal(file: BinaryIO) -> bool:
@@ -123,15 +141,25 @@ def _check_seal(file: BinaryIO) -> bool:
     return True
 
 
-def _size(content: Any) -> int:
-    """Bytes of all tensors; a view may claim more than the file holds."""
-    if isinstance(content, Mapping):
-        return sum(_size(value) for value in content.values())
-    if isinstance(content, list | tuple):
-        return sum(_size(value) for value in content)
-    if isinstance(content, Tensor):
-        return content.numel() * content.element_size()
-    return 0
+def _parts(content: Any) -> list[Any]:
+    """All parts of a content, shared ones as often as whoever goes over it meets them.
+
+    Raises:
+        ValueError: they are more than any file of a run has, or nested without end.
+    """
+    parts, level = [], [content]
+    for _ in range(MAX_DEPTH):
+        parts += level
+        inner = []
+        for part in level:
+            inner += part.values() if isinstance(part, Mapping) else ()
+            inner += part if isinstance(part, list | tuple) else ()
+            if len(parts) + len(inner) > MAX_PARTS:
+                raise ValueError(f"it has more than {MAX_PARTS} parts")
+        level = inner
+    if level:
+        raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep")
+    return parts
 
 
 def first_non_finite(state: Any, path: str = "") -> str:

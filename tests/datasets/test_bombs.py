@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from flashdex.datasets import pickles
 from flashdex.datasets.fields import numbers
 from flashdex.datasets.files import (
     load_npy,
@@ -24,6 +23,8 @@ from flashdex.datasets.files import (
     read_text,
 )
 from flashdex.errors import DemoError
+from flashdex.system import pickled
+from flashdex.system.tensors import read_tensors, write_tensors
 
 LOADERS = {
     "pickle": load_pickle,
@@ -209,6 +210,55 @@ def test_pickle_of_keys_that_never_end(tmp_path, levels):
         load_pickle(path)
 
 
+@pytest.mark.parametrize("is_old", [False, True], ids=["archive", "old_layout"])
+def test_torch_file_of_keys_that_never_end(tmp_path, is_old):
+    path = tmp_path / "a.pt"
+    torch.save({}, path, _use_new_zipfile_serialization=not is_old)
+    content = path.read_bytes()
+    if is_old:
+        empty = pickle.dumps({}, 2)
+        assert content.count(empty) == 1
+        path.write_bytes(content.replace(empty, nested_keys(60)))
+    else:
+        zipped(path, {"a/data.pkl": nested_keys(60), "a/version": "3\n"})
+    with pytest.raises(DemoError, match="keys that would take hours"):
+        load_torch(path)
+    if not is_old:
+        with pytest.raises(ValueError, match="keys that would take hours"):
+            read_tensors(tmp_path, "a.pt")
+
+
+@pytest.mark.parametrize("levels", [9, 40])
+def test_tensors_in_lists_of_the_same_lists_are_not_walked(tmp_path, levels):
+    write_tensors({"a": laughs(levels, list)}, tmp_path, "a.pt")
+    with pytest.raises(ValueError, match="more than 1000000 parts"):
+        read_tensors(tmp_path, "a.pt")
+
+
+def test_a_view_in_a_file_of_a_run_is_not_made_true(tmp_path):
+    write_tensors({"a": torch.ones(1).expand(1 << 10, 1 << 15)}, tmp_path, "a.pt")
+    with pytest.raises(ValueError, match="its tensors claim 128 MiB"):
+        read_tensors(tmp_path, "a.pt")
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        pytest.param(torch.empty(9, device="meta"), id="meta"),
+        pytest.param(torch.eye(3).to_sparse(), id="sparse"),
+        pytest.param(torch.ones(3).to(torch.float8_e4m3fn), id="without_arithmetic"),
+        pytest.param([[[]]] * 9 + [laughs(0, lambda x: x)], id="plain"),
+    ],
+)
+def test_tensors_that_hold_no_numbers_of_their_own_are_refused(tmp_path, odd):
+    write_tensors({"a": odd}, tmp_path, "a.pt")
+    if isinstance(odd, list):
+        assert read_tensors(tmp_path, "a.pt") == {"a": odd}
+        return
+    with pytest.raises(ValueError, match="not plain"):
+        read_tensors(tmp_path, "a.pt")
+
+
 def test_pickle_of_one_large_key_many_times(tmp_path):
     path, size = tmp_path / "a.pkl", 30_000
     key = b"(" + b"K\x01" * size + b"tq\x00"
@@ -218,7 +268,7 @@ def test_pickle_of_one_large_key_many_times(tmp_path):
 
 
 def test_pickle_of_endless_steps_is_one_message(tmp_path, monkeypatch):
-    monkeypatch.setattr(pickles, "MAX_STEPS", 1000)
+    monkeypatch.setattr(pickled, "MAX_STEPS", 1000)
     path = tmp_path / "a.pkl"
     path.write_bytes(b"N0" * 2000 + b"N.")
     with pytest.raises(DemoError, match="more than 1,000 steps"):

@@ -9,7 +9,7 @@ from layouts import mutations
 from layouts.mano_files import write_mano
 
 from flashdex.datasets import list_recordings
-from flashdex.datasets.roots import listed, listed_below
+from flashdex.datasets.roots import listed, listed_below, on_disk
 from flashdex.datasets.source import SourceOptions
 from flashdex.errors import DemoError
 from flashdex.objects.mesh_files import MESH_SUFFIXES
@@ -139,6 +139,11 @@ def test_pipe_among_the_files_costs_one_recording(tmp_path, mano, layout):
         told = str(error)
     assert str(root) in told
     assert found.items() <= whole.items()
+
+
+def test_accents_are_the_same_in_both_their_forms(tmp_path):
+    (tmp_path / "e\u0301.obj").touch()  # as macOS stores them
+    assert on_disk(tmp_path / "\u00e9.OBJ") == tmp_path / "e\u0301.obj"
 
 
 def test_links_in_a_circle_end(tmp_path):

@@ -27,15 +27,25 @@ def codes(findings):
     return [(f.code, f.level) for f in findings]
 
 
-def test_hand_under_the_name_of_the_other_is_rejected(demo):
+@pytest.mark.parametrize("palm", ["of the points", "of the other hand"])
+def test_hand_under_the_name_of_the_other_is_rejected(demo, palm):
     assert check_sides(demo) == []
     points = demo.keypoints["right"]
-    other = replace(
-        demo, keypoints={"left": points}, palm={"left": palm_frame(points, "left")}
-    )
+    own = palm_frame(points, "left" if palm == "of the points" else "right")
+    other = replace(demo, keypoints={"left": points}, palm={"left": own})
     (found,) = check_sides(other)
     assert (found.code, found.level) == ("E_SIDE", "reject")
     assert "left and right swapped" in found.text
+
+
+@pytest.mark.parametrize("tips", [(4, 8, 12, 16, 20), (8, 12, 16, 20, 4)])
+def test_order_of_mano_is_named_whatever_that_of_its_tips(demo, tips):
+    joints = [5, 6, 7, 9, 10, 11, 17, 18, 19, 13, 14, 15, 1, 2, 3]
+    points = demo.keypoints["right"][:, [0, *joints, *tips]]
+    palm = {"right": demo.palm["right"]}
+    (found,) = check_sides(replace(demo, keypoints={"right": points}, palm=palm))
+    assert (found.code, found.level) == ("E_SIDE", "reject")
+    assert "MANO's order" in found.text
 
 
 def test_mirrored_world_is_rejected(demo):

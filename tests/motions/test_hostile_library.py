@@ -200,6 +200,7 @@ MESHES = {
     "no-faces": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n",
     "face-outside": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 9\n",
     "face-zero": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 0 1 2\n",
+    "face-of-30-digits": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 " + b"9" * 30,
     "words": b"v a b c\nf 1 2 3\n",
     "face-of-70-bits": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 %d\n" % (2**70),
     "many-faces": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + b"f 1 2 3\n" * 20_001,

@@ -12,7 +12,7 @@ from test_library import make_record, write
 
 from flashdex.errors import LibraryError
 from flashdex.motions.library import MotionLibrary
-from flashdex.motions.library_writer import LibraryWriter
+from flashdex.motions.library_writer import LibraryWriter, check_target
 from flashdex.motions.pipeline.prepare import Order, run_order
 from flashdex.reports.library.report import write_library_report
 
@@ -129,6 +129,19 @@ REFUSED = {
     "link-to-a-file": lambda path: path.symlink_to(__file__),
     "fifo": os.mkfifo,
 }
+
+
+@pytest.mark.parametrize("name", [".DS_Store", "lost+found"])
+def test_what_a_disk_puts_into_an_empty_folder_is_let_pass(tmp_path, record, name):
+    (tmp_path / "out" / name).mkdir(parents=True)
+    check_target(tmp_path / "out")
+    assert names_of(write([record], tmp_path / "out")) == ["new"]
+    assert (tmp_path / "out" / name).is_dir()
+
+
+def test_a_name_too_long_is_refused_before_the_work(tmp_path):
+    with pytest.raises(LibraryError, match="cannot be a path"):
+        check_target(tmp_path / ("a" * 300))
 
 
 @pytest.mark.parametrize("case", REFUSED)

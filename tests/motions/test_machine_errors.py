@@ -98,6 +98,21 @@ def test_an_object_is_not_made_of_one_hull_when_the_machine_fails(
     assert not list(tmp_path.glob("objects/*.npz"))
 
 
+def test_what_nobody_foresaw_is_not_kept(tmp_path, write_keypoints, monkeypatch):
+    demo = procedural(0, kinds=["pick_box_right"])[0].cut(0, 40, name="clip")
+    (listed,) = list_recordings("keypoints", SourceOptions(path=write_keypoints(demo)))
+    left = [RuntimeError("can't start new thread")]
+
+    def fail(*_):
+        raise left.pop() if left else DemoError("seen again", code="AGAIN")
+
+    monkeypatch.setattr("flashdex.motions.pipeline.motion.repair", fail)
+    monkeypatch.setattr("flashdex.motions.pipeline.motion.settle_objects", fail)
+    job = Job(listed, MotionSettings(attempts=1, cache_dir=tmp_path / "cache"))
+    reasons = [run_job(job).rows[0]["reason"].split(":")[0] for _ in range(2)]
+    assert reasons == ["E_READ", "AGAIN"]
+
+
 @pytest.mark.parametrize(
     "error",
     [

@@ -260,9 +260,11 @@ def test_zero_quaternion_is_a_gap(demo):
     assert codes(found) == [("E_NAN", "info")]
 
 
-def test_points_that_are_missing_alone_are_named(demo):
-    demo.keypoints["right"][15:65, 20] = np.nan
-    pieces, found = repair(demo)
+@pytest.mark.parametrize("mark", MARKS)
+def test_points_that_are_missing_alone_are_named(demo, mark):
+    points = demo.keypoints["right"].copy()
+    points[15:65, 20] = mark
+    pieces, found = repair(replace(demo, keypoints=demo.keypoints | {"right": points}))
     assert pieces == []
     assert "right hand: keypoint 20 (pinky tip) missing in 50 frames" in found[0].text
 

@@ -67,6 +67,12 @@ def short_steps(scene):
     scene["accessors"] += [odd]
 
 
+def negative(scene):
+    """Many numbers more, and as many less."""
+    more = {"bufferView": 0, "type": "VEC3", "componentType": 5126, "count": 9**9}
+    scene["accessors"] += [more, {**more, "count": -(9**9)}]
+
+
 def elsewhere(scene):
     scene["buffers"] = [{"uri": "secret.bin", "byteLength": 8}]
 
@@ -104,6 +110,7 @@ HOSTILE = {
     "glb_short_steps": ("a.glb", glb(short_steps)),
     "glb_other_file": ("a.glb", glb(elsewhere)),
     "glb_deep_json": ("a.glb", pack(b"[" * 100_000)),
+    "glb_negative": ("a.glb", glb(negative)),
     "glb_short": ("a.glb", b"glTF\2\0\0\0"),
     "glb_length": ("a.glb", b"glTF\2\0\0\0" + b"\xff" * 8 + b"JSON{}"),
 }
@@ -146,6 +153,23 @@ def test_many_solids_are_refused(tmp_path):
     (tmp_path / "a.stl").write_text("solid a\nendsolid a\n" * 2000)
     with pytest.raises(MeshError, match="1000 solids"):
         load_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".ply"])
+def test_lines_without_end_are_not_parsed(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(mesh_files.trimesh, "load_scene", None)
+    monkeypatch.setattr(mesh_files, "MAX_LINES", 1000)
+    (tmp_path / f"a{suffix}").write_bytes(b"v 0 0 0\n" * 1001)
+    with pytest.raises(MeshError, match="1001 lines; at most 1000"):
+        load_mesh(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("join", [b" ", b" \\\n"], ids=["one", "joined"])
+def test_a_polygon_without_end_is_not_parsed(tmp_path, monkeypatch, join):
+    monkeypatch.setattr(mesh_files.trimesh, "load_scene", None)
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 0\n" * 4 + b"f" + (join + b"1") * 99_999)
+    with pytest.raises(MeshError, match="a line of more than 128 KiB"):
+        load_mesh(tmp_path / "a.obj")
 
 
 def test_large_file_is_not_read(tmp_path, monkeypatch):

@@ -4,12 +4,14 @@ import errno
 import io
 import os
 import pickle
+import struct
 import zipfile
 import zlib
 
 import numpy as np
 import pytest
 
+from flashdex.system import archives
 from flashdex.system.archives import check_archive, read_array, read_npz
 
 
@@ -115,6 +117,24 @@ def test_bombs_are_refused_by_what_they_declare(tmp_path):
         read_npz(plain, limit=1 << 19)
 
 
+@pytest.mark.parametrize("newer", [False, True], ids=["old_record", "newer_record"])
+@pytest.mark.parametrize("before", [b"", b"PK\5\6" + bytes(9)], ids=["", "overlapped"])
+def test_a_list_of_members_without_end_is_not_read(
+    tmp_path, newer, before, monkeypatch
+):
+    monkeypatch.setattr(archives.zipfile, "ZipFile", None)
+    size = archives.MAX_DIRECTORY + 1
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 9, 9, size, 0, 0)
+    if newer:
+        count = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 9, 9, size, 0)
+        end = end.replace(struct.pack("<L", size), b"\xff" * 4)
+        end = count + struct.pack("<4sLQL", b"PK\6\7", 0, 0, 1) + end
+    (tmp_path / "a.npz").write_bytes(before + end)
+    for read in (read_npz, check_archive):
+        with pytest.raises(ValueError, match="list of files is larger than 32 MiB"):
+            read(tmp_path / "a.npz")
+
+
 def test_a_member_that_lies_about_its_size_is_refused(tmp_path):
     path = write_zip(tmp_path / "a.npz", {"a.npy": npy(np.zeros(50_000))})
     content = path.read_bytes()
@@ -128,4 +148,4 @@ def test_a_member_that_lies_about_its_size_is_refused(tmp_path):
 def test_bytes_of_a_header_are_bounded():
     size = (50_000).to_bytes(4, "little")
     with pytest.raises(ValueError, match=r"."):
-        read_array(b"\x93NUMPY\x02\x00" + size + b" " * 50_000)
+        read_array(io.BytesIO(b"\x93NUMPY\x02\x00" + size + b" " * 50_000), 50_012)

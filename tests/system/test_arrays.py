@@ -27,6 +27,29 @@ def test_an_array_comes_back_and_its_file_stays_as_it_is(stored):
     assert map_array(root, "b.npy", write_array(root / "b.npy", empty)).shape == (0, 3)
 
 
+@pytest.mark.parametrize("step", [1 << 40, 1 << 28], ids=["whole", "sprinkled"])
+def test_an_array_of_holes_is_not_read(tmp_path, step):
+    entry = write_array(tmp_path / "a.npy", np.zeros(1000, np.uint8))
+    big = ArrayEntry("uint8", (1 << 3, 1 << 30), entry.sha256)
+    with (tmp_path / "a.npy").open("wb") as file:
+        head = {"descr": "|u1", "fortran_order": False, "shape": big.shape}
+        np.lib.format.write_array_header_1_0(file, head)
+        start = file.tell()
+        for place in range(start, start + big.num_bytes, step):
+            file.seek(place)
+            file.write(b"1")
+        file.truncate(start + big.num_bytes)
+    with pytest.raises(RunError, match="holes of more than 1024 MiB"):
+        map_array(tmp_path, "a.npy", big)
+
+
+def test_what_is_too_large_has_no_hash(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert hash_content(tmp_path / "a", most=5) == hash_content(tmp_path / "a") != ""
+    os.truncate(tmp_path / "a", 1 << 40)
+    assert hash_content(tmp_path / "a", most=5) == ""
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[:-4])
 

@@ -9,7 +9,13 @@ import pytest
 
 from flashdex.errors import RunError
 from flashdex.system import jsonl
-from flashdex.system.jsonl import append_line, drop_cut_line, keep_lines, read_lines
+from flashdex.system.jsonl import (
+    append_line,
+    drop_cut_line,
+    keep_lines,
+    parse_json,
+    read_lines,
+)
 
 LINES = [{"n": i, "name": "\u00e4", "x": i / 7} for i in range(5)]
 
@@ -123,6 +129,24 @@ def test_a_full_disk_leaves_whole_lines(file, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         append_line(file, {"n": 5})
     assert file.read_bytes() == content
+
+
+def test_a_hole_on_the_disk_is_not_read(file):
+    os.truncate(file, 1 << 40)
+    with pytest.raises(RunError, match="larger than 512 MiB"):
+        read_lines(file)
+
+
+@pytest.mark.parametrize("text", ["[" + "[]," * 999 + "0]", "[" + "0," * 999 + "{}]"])
+def test_values_are_counted_before_they_are_built(file, tmp_path, monkeypatch, text):
+    monkeypatch.setattr(jsonl, "MAX_VALUES", 900)
+    monkeypatch.setattr(jsonl.json, "loads", None)
+    with pytest.raises(ValueError, match="more than 900 values"):
+        parse_json(text.encode())
+    with file.open("a") as stream:
+        stream.write(f'{{"a": {text}}}\n')
+    with pytest.raises(RunError, match="more than 900 values"):
+        read_lines(file)
 
 
 @pytest.mark.parametrize("kind", ["link", "dangling", "pipe", "folder"])

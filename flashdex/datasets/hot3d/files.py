@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from flashdex.datasets.files import read_text, told
 from flashdex.errors import DemoError, is_of_machine
 from flashdex.keys import SIDES, Side
+from flashdex.system.jsonl import parse_json
 
 POSE_HEADER = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m]"
 POSE_COLUMNS = (*POSE_HEADER.split(","), "q_wo_w", "q_wo_x", "q_wo_y", "q_wo_z")
@@ -79,11 +79,11 @@ def read_hands(file: Path, widths: dict[str, int]) -> dict[Side, Track]:
     hand that occurs: wrist position (m), quaternion wxyz, then the fields.
     """
     rows: dict[Side, list[tuple[int, list[float]]]] = {side: [] for side in SIDES}
-    for number, line in enumerate(read_lines(file), start=1):
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
         if not line.strip():
             continue
         with _cells(file, number):
-            record = json.loads(line)
+            record = parse_json(line.encode("utf-8"))
             time = _stamp(record["timestamp_ns"])
             for key, hand in record["hand_poses"].items():
                 if hand is not None:
@@ -116,10 +116,10 @@ def _cells(file: Path, line: int) -> AbstractContextManager[None]:
     return told(f"{file}, line {line}", "not a row of this file (download it again)")
 
 
-def read_lines(file: Path) -> list[str]:
-    """Lines of a text file; where it is missing, the message lists what is there."""
+def text_of(file: Path) -> str:
+    """The text of a file; where it is missing, the message lists what is there."""
     try:
-        return read_text(file).splitlines()
+        return read_text(file)
     except FileNotFoundError as error:
         found = ", ".join(sorted(p.name for p in file.parent.glob("*"))) or "nothing"
         raise DemoError(
@@ -135,26 +135,30 @@ def read_lines(file: Path) -> list[str]:
 
 def _table(file: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and the cells of ``columns`` in this order."""
-    try:
-        rows = list(csv.reader(read_lines(file)))
-    except csv.Error as error:
-        raise DemoError(
-            f"{file}: not a table of comma-separated cells: {error}."
-        ) from error
-    header = [name.strip() for name in rows[0]] if rows else []
+    rows = _rows(file)  # one at a time: a row of cells takes forty times its text
+    header = [name.strip() for name in next(rows, [])]
     missing = [name for name in columns if name not in header]
     if missing:
         raise DemoError(
             f"{file}: lacks the columns {', '.join(missing)}. Its first line is "
-            f"'{','.join(header)}'."
+            f"'{','.join(header)[:200]}'."
         )
     places = [header.index(name) for name in columns]
-    for line, row in enumerate(rows[1:], start=2):
+    for line, row in enumerate(rows, start=2):
         if row:
             with _cells(file, line):
                 if len(row) < len(header):
                     raise ValueError(f"{len(row)} cells, {len(header)} expected")
             yield line, [row[place] for place in places]
+
+
+def _rows(file: Path) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(text_of(file).splitlines())
+    except csv.Error as error:
+        raise DemoError(
+            f"{file}: not a table of comma-separated cells: {error}."
+        ) from error
 
 
 def _track(rows: list[tuple[int, list[float]]], width: int) -> Track:

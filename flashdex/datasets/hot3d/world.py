@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,10 +10,11 @@ import numpy as np
 
 from flashdex.datasets.demo import DemoObject
 from flashdex.datasets.files import read_json, refuse_clone, refuse_pointer, told
-from flashdex.datasets.hot3d.files import FrameAxis, Track, read_lines
+from flashdex.datasets.hot3d.files import FrameAxis, Track, text_of
 from flashdex.datasets.roots import listed, on_disk
 from flashdex.errors import DemoError
 from flashdex.system.files import hash_file
+from flashdex.system.jsonl import parse_json
 
 Up = Literal["z", "y"]
 # Aria: origin near the first headset position; Quest: origin on the floor
@@ -42,7 +42,7 @@ def read_metadata(file: Path) -> Metadata:
     """``metadata.json``, old and new layout."""
     fault = "not the metadata of a HOT3D sequence, JSON with headset, participant_id"
     with told(file, fault):
-        data = json.loads("\n".join(read_lines(file)))
+        data = parse_json(text_of(file).encode("utf-8"))
         uids, names = data.get("object_uids") or [], data.get("object_names") or []
         return Metadata(
             headset=str(data.get("headset", "")),

@@ -57,7 +57,8 @@ def _is_mano_order(points: np.ndarray) -> bool:
     """Whether keypoints (T, 21, 3) make hands in MANO's order, and none in ours."""
 
     def longest(points: np.ndarray) -> float:
-        fingers = points[:, 1:].reshape(-1, 5, 4, 3)
+        # without the tips, which everybody puts in another order
+        fingers = points[:, 1:].reshape(-1, 5, 4, 3)[:, :, :3]
         bones = np.linalg.norm(np.diff(fingers, axis=2), axis=-1)
         return float(np.median(bones, axis=0).max())
 
@@ -118,23 +119,30 @@ def check_sides(demo: HumanDemo) -> list[Finding]:
     """Fingers that bend out of the back of the hand: it is the other hand."""
     found = []
     for side, points in demo.keypoints.items():
-        if _is_scalar_last(demo.palm[side], palm_frame(points, side)):
+        seen = palm_frame(points, side)
+        if _is_scalar_last(demo.palm[side], seen):
             text = f"the {side} palm's quaternions are xyzw; wxyz are needed"
             found.append(reject("E_ROT", text))
             continue
-        out_of_palm = rotation(demo.palm[side][:, 3:]).as_matrix()[..., 2]
-        fingers = points[:, TIPS] - points[:, KNUCKLES]
-        bend = float(np.einsum("ti,tfi->tf", out_of_palm, fingers).mean())
+        if _is_mano_order(points):
+            text = f"the {side} hand's joints are in MANO's order; wrist, then "
+            text += "thumb to pinky, from the palm outwards, are needed"
+            found.append(reject("E_SIDE", text))
+            continue
+        # a palm that is given may be that of the other hand as well as the points
+        bend = min(_bend(demo.palm[side], points), _bend(seen, points))
         if not bend > BENT_BACK:
-            if _is_mano_order(points):
-                text = f"the {side} hand's joints are in MANO's order; wrist, then "
-                text += "thumb to pinky, from the palm outwards, are needed"
-                found.append(reject("E_SIDE", text))
-                continue
             text = f"the {side} hand's fingers bend {-100 * bend:.0f} cm out of its "
             text += "back; are left and right swapped, or is the world mirrored?"
             found.append(reject("E_SIDE", text))
     return found
+
+
+def _bend(palm: np.ndarray, points: np.ndarray) -> float:
+    """Mean of the tips out of a palm (T, 7), to where fingers bend, m."""
+    out_of_palm = rotation(palm[:, 3:]).as_matrix()[..., 2]
+    fingers = points[:, TIPS] - points[:, KNUCKLES]
+    return float(np.einsum("ti,tfi->tf", out_of_palm, fingers).mean())
 
 
 def _is_scalar_last(given: np.ndarray, seen: np.ndarray) -> bool:

@@ -91,7 +91,7 @@ class Prepared:
 
     record: MotionRecord | None
     row: dict[str, Any]
-    passing: bool = False  # memory or a disk failed: another time it may go well
+    passing: bool = False  # no fault of the recording: another time it may go well
 
 
 def prepare_recording(recording: Recording, settings: MotionSettings) -> list[Prepared]:
@@ -139,7 +139,9 @@ def _guard(name: str, make: Callable[[], list[Prepared]]) -> list[Prepared]:
     except Exception as error:  # what no check foresaw must not end the others
         logger.debug("%s", name, exc_info=True)
         item = rejected(name, [of_error(error)])
-        passing = isinstance(error, OSError) or is_of_machine(error)
+        # libraries tell want of memory or threads in words of their own
+        foreseen = isinstance(error, DemoError | MeshError)
+        passing = not foreseen or is_of_machine(error)
         return [replace(item, passing=passing)]
 
 

@@ -165,6 +165,15 @@ def read_array(
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
+def _read_head(file: IO[bytes]) -> bytes:
+    """Magic, version, length and text of a header, as far as they are there."""
+    head = file.read(10)
+    if head[6:7] > b"\1":  # whose length has four bytes
+        head += file.read(2)
+    size = int.from_bytes(head[8:], "little")
+    return head + file.read(min(size, MAX_HEADER + 1))
+
+
 def read_header(
     file: IO[bytes], *, objects: bool = False
 ) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -176,11 +185,12 @@ def read_header(
         ValueError: damaged, of nothing, with impossible sizes, or of objects where
             these are not wanted.
     """
+    head = io.BytesIO(_read_head(file))  # what the file itself fails at is no damage
     try:
-        version = np.lib.format.read_magic(file)
+        version = np.lib.format.read_magic(head)
         read = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")
-        shape, by_columns, dtype = read(file, max_header_size=MAX_HEADER)
-    except (ValueError, zipfile.BadZipFile):
+        shape, by_columns, dtype = read(head, max_header_size=MAX_HEADER)
+    except ValueError:
         raise
     except MemoryError:  # Python's parser says so of text that is too deep for it
         raise ValueError("its header is nested too deep") from None

@@ -16,12 +16,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from flashdex.envs.scene.perturbation import PERTURBATION, Perturbation
 from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
 from flashdex.rollouts.findings import OLD, Finding, at, differences, short
 from flashdex.rollouts.resimulation import (
-    PERTURBATION,
-    Perturbation,
     Replay,
     Simulation,
     load_simulation,

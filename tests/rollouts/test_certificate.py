@@ -9,7 +9,7 @@ import pytest
 from flashdex.errors import FlashdexError, UnknownNameError
 from flashdex.metrics.criteria_table import criterion_names
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.resimulation import Perturbation
+from flashdex.envs.scene.perturbation import Perturbation
 from flashdex.rollouts.rollout import Rollout
 
 

@@ -6,14 +6,14 @@ import json
 import logging
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
 from flashdex.errors import FlashdexError, RunError
 from flashdex.metrics.criteria import moves_too_little, stays_behind
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
-from flashdex.rollouts.certificate import PROVEN, certify
+from flashdex.rollouts.certificate import PROVEN, Certificate, certify
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.rollout import Rollout
 from flashdex.system.arrays import hash_content
@@ -22,6 +22,7 @@ from flashdex.system.jsonl import append_line, drop_cut_line, read_lines
 from flashdex.system.names import check_name, check_names, file_stem
 from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
 
+Source = Literal["policy", "search"]
 _LOG = logging.getLogger(__name__)
 # what a line holds, of any version
 LINE: dict[str, type | tuple[type, ...]] = {
@@ -35,14 +36,14 @@ LINE: dict[str, type | tuple[type, ...]] = {
 # what newer versions, or only some lines, hold besides
 _MORE: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("passed", "hands", "why", "trivial"), (list,)),
-    **dict.fromkeys(("frame", "seed"), (int,)),
+    **dict.fromkeys(("frame", "seed", "rung"), (int,)),
     **dict.fromkeys(("rollout", "verdict"), (str, type(None))),
     **dict.fromkeys(("rollout_sha256", "certificate_sha256"), (str, type(None))),
     **dict.fromkeys(("lift_ratio", "path_ratio"), (float, int, type(None))),
     "certified": (bool, type(None)),
     "completed": (bool,),
-    "gpu_s": (float, int),
-    "engine": (str,),
+    **dict.fromkeys(("gpu_s", "core_s"), (float, int)),
+    **dict.fromkeys(("engine", "source"), (str,)),
 }
 
 
@@ -81,6 +82,7 @@ class Ledger(Tally):
 
     Seconds count as a GPU's where one steps the physics (``on_gpu``). Conversions get a
     certificate if ``certify``. ``trivial``: baselines that already pass a motion.
+    ``source`` is who finds the attempts.
     """
 
     def __init__(
@@ -94,18 +96,26 @@ class Ledger(Tally):
         on_gpu: bool = False,
         certify: bool = True,
         trivial: dict[str, list[str]] | None = None,
+        source: Source = "policy",
     ) -> None:
         check_names(names, what="motion")
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.path = run_dir, own_file(run_dir, CONVERSIONS)
         self.rollouts = own_folder(run_dir, ROLLOUTS)
         self.seed, self.engine, self.on_gpu = seed, engine, on_gpu
+        self.source = source
         self.certify, self.trivial = certify, trivial or {}
         drop_cut_line(self.path)
         super().__init__(names, criterion, read_ledger(self.path))  # earlier sessions
 
     def record(
-        self, rollout: Rollout, *, wall_s: float, is_own: bool = True
+        self,
+        rollout: Rollout,
+        *,
+        wall_s: float,
+        is_own: bool = True,
+        certificate: Certificate | None = None,
+        more: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], bool]:
         """Score one attempt, write its line and count it.
 
@@ -114,6 +124,9 @@ class Ledger(Tally):
             wall_s: seconds of the run so far.
             is_own: it was made here; a model that was found in a file is tried in a
                 child process first.
+            certificate: of the rollout, where it has been made already; one that is
+                robust may replace what is only certified.
+            more: entries of the line that its source adds.
 
         Returns:
             The line, and whether the motion is done by this attempt.
@@ -126,6 +139,8 @@ class Ledger(Tally):
             "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
+            "source": self.source,
+            **(more or {}),
             "trivial": self._trivial(rollout),
         }
         before = self.conversions.get(name)
@@ -136,12 +151,15 @@ class Ledger(Tally):
             or self.moves_more(line, before)
             or (
                 self.certify
-                and not before["certified"]
                 and not self.moves_more(before, line)
+                and (not before["certified"] or _is_better(certificate, before))
             )
         )
         if line["converted"] and is_wanted:
-            line.update(self._store(rollout, line["errors"], is_own=is_own))
+            rollout.errors = json.dumps(line["errors"])
+            if certificate is None and self.certify:
+                certificate = _prove(rollout, is_own=is_own)
+            line.update(self._store(rollout, certificate))
         append_line(self.path, line)
         return line, self.count(line)
 
@@ -151,10 +169,9 @@ class Ledger(Tally):
         return [*self.trivial.get(rollout.motion, []), *unmoved]
 
     def _store(
-        self, rollout: Rollout, errors: dict[str, float], *, is_own: bool
+        self, rollout: Rollout, certificate: Certificate | None
     ) -> dict[str, Any]:
         """Store a rollout that passed; what its line says of the files."""
-        rollout.errors = json.dumps(errors)
         named = rollout_name(rollout.motion)
         path = own_file(self.run_dir, named)
         proof = own_file(self.run_dir, certificate_name(rollout.motion))
@@ -165,12 +182,7 @@ class Ledger(Tally):
         out: dict[str, Any] = {"rollout": named, "rollout_sha256": hash_content(path)}
         if not self.certify:
             return out
-        try:
-            xml = rollout.model_xml
-            model = mujoco.MjModel.from_xml_string(xml) if is_own else None
-            certificate = certify(rollout, model=model)
-        except (FlashdexError, ValueError) as error:
-            _LOG.warning("%s: not certified: %s", rollout.motion, error)
+        if certificate is None:
             return {**out, "certified": False, "verdict": "not_measured"}
         certificate.save(proof)
         verdict = certificate.verdict
@@ -226,6 +238,22 @@ class Ledger(Tally):
     def num_bytes(self) -> int:
         """Length of the file."""
         return self.path.stat().st_size if self.path.is_file() else 0
+
+
+def _prove(rollout: Rollout, *, is_own: bool) -> Certificate | None:
+    try:
+        xml = rollout.model_xml
+        model = mujoco.MjModel.from_xml_string(xml) if is_own else None
+        return certify(rollout, model=model)
+    except (FlashdexError, ValueError) as error:
+        _LOG.warning("%s: not certified: %s", rollout.motion, error)
+        return None
+
+
+def _is_better(certificate: Certificate | None, before: dict[str, Any]) -> bool:
+    """A proof of robustness, against a line whose rollout has none."""
+    is_robust = certificate is not None and certificate.verdict == "robust"
+    return is_robust and before.get("verdict") != "robust"
 
 
 # what every line holds since runs have an id, and of which one run has one value

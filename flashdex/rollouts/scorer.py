@@ -83,7 +83,7 @@ class ProcessScorer:
         self.ledger = ledger
         # A fork would share the GPU's state. One process: lines keep their order.
         self._pool = ProcessPoolExecutor(
-            1, mp_context=mp.get_context("spawn"), initializer=_live_with_parent
+            1, mp_context=mp.get_context("spawn"), initializer=live_with_parent
         )
         self._opened: Future[None] | None = self._pool.submit(_open, spec, make)
         self._line: deque[Future[dict[str, Any]]] = deque()
@@ -148,7 +148,7 @@ Scorer = InlineScorer | ProcessScorer
 _opened: list[InlineScorer] = []  # of the scoring process
 
 
-def _live_with_parent() -> None:
+def live_with_parent() -> None:
     """First thing in the process: live and die with the loop."""
     # A signal to the whole group ends the loop, which ends this in order.
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):

@@ -34,6 +34,14 @@ def _ladder() -> list[Rung]:
     ]
 
 
+def _robust_ladder() -> list[Rung]:
+    return [
+        Rung(samples=16, rounds=1, horizon=24, worlds=4),
+        Rung(samples=24, rounds=2, horizon=24, worlds=4),
+        Rung(samples=32, rounds=3, horizon=30, worlds=6),
+    ]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
     """Search for the actions of one motion after the other, without a policy.
@@ -82,3 +90,6 @@ class SearchConfig:
     """Processes, one motion each at a time; 0 = one a core."""
     ladder: list[Rung] = dataclasses.field(default_factory=_ladder)
     """Settings tried in turn, cheapest first, until a plan passes."""
+    robust_ladder: list[Rung] = dataclasses.field(default_factory=_robust_ladder)
+    """Those tried then, in several worlds, until a plan survives perturbations, too;
+    empty = one that passes is enough."""

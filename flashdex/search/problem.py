@@ -86,8 +86,10 @@ class Problem:
     ) -> None:
         self.hands, self.scene, self.row = hands, scene, row
         self._map, self._env, self._decimation = states, env, decimation
-        self.name, self.steps = bank.names[row], int(bank.length[row]) - 1
+        longest = round(env.max_seconds * bank.fps)
+        self.steps = min(int(bank.length[row]) - 1, longest)
         active = bank.hand_active[row].tolist()
+        self.is_active: list[bool] = active
         self.active = [i for i in range(2) if active[i]]
         self.num_joints = bank.num_joints
         rows = torch.full((self.steps,), row)

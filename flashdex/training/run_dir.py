@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RecipeError, RunError
-from flashdex.recipe import GymRecipe, RunRecipe, dump_recipe, load_recipe
+from flashdex.errors import FlashdexError, RecipeError, RunError
+from flashdex.recipe import GymRecipe, RunRecipe, SearchRecipe, dump_recipe, load_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.files import RunHold
@@ -67,7 +67,16 @@ def default_run_dir(recipe: RunRecipe) -> Path:
 
 
 def task_of(recipe: RunRecipe) -> type[Task]:
-    """What a recipe trains."""
+    """What a recipe trains.
+
+    Raises:
+        FlashdexError: nothing, it is of a search.
+    """
+    if isinstance(recipe, SearchRecipe):
+        raise FlashdexError(
+            f"'{recipe.name}' has task: search, which trains nothing; use 'flashdex "
+            "search'"
+        )
     return GymTask if isinstance(recipe, GymRecipe) else TrackingTask
 
 

@@ -41,7 +41,7 @@ class TrainConfig(LoopConfig):
     """Learn in a second thread while the physics steps: same results, faster with two
     cores."""
     stop_when_all_converted: bool = True
-    """Stop once every motion has a conversion in which its object moves as it should."""
+    """Stop once every motion has a conversion in which its object moves as it must."""
     criterion: CriterionName = "sr_mt_obj"
     """What counts as a conversion (see docs on criteria)."""
     judge: Literal["auto", "inline", "process"] = "auto"

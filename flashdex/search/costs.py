@@ -39,7 +39,9 @@ class ErrorLimits:
     @classmethod
     def of(cls, criterion: str) -> ErrorLimits:
         """Limits of a named criterion; the usual ones of what it does not limit."""
-        (found,) = [c for c in make_criteria() if c.name == resolve_criterion(criterion)]
+        (found,) = [
+            c for c in make_criteria() if c.name == resolve_criterion(criterion)
+        ]
         terms = {term.quantity: term.limit for term in found.terms}
         usual = Limits()
         return cls(

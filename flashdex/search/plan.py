@@ -116,9 +116,7 @@ class Planner:
             tried = tried.clip(-1, 1)
             actions = problem.spread(np.einsum("hq,nqaj->nhaj", basis, tried))
             trial = problem.simulate(worlds, actions, first)
-            costs = cost(
-                trial, tried, self._noise, problem, config, first, self.limits
-            )
+            costs = cost(trial, tried, self._noise, problem, config, first, self.limits)
             order = np.argsort(costs, kind="stable")
             middle = tried[order[: config.elite]].mean(0)
             if costs[order[0]] < lowest:

@@ -136,7 +136,7 @@ class Problem:
         return out
 
     def _reference_tips(self, joints: Tensor) -> Array:
-        """Fingertips of the robot's own reference in the objects' frames, (S, A, 5, 3)."""
+        """Fingertips of the reference joints in the objects' frames, (S, A, 5, 3)."""
         data, out = mujoco.MjData(self.model), []
         adr = [self.scene.joint_qpos(keys.SIDES[i]) for i in self.active]
         data.qpos[:] = self.qpos0
@@ -151,7 +151,7 @@ class Problem:
         return self._tips(np.array(out))
 
     def spread(self, residual: Array) -> NDArray[np.float32]:
-        """Actions of both hands (..., 2, J) from those that take part, (..., A, J)."""
+        """Actions of both hands (..., 2, J) of those that take part, (..., A, J)."""
         out = np.zeros((*residual.shape[:-2], 2, self.num_joints), np.float32)
         out[..., self.active, :] = residual
         return out
@@ -186,7 +186,7 @@ class Problem:
         return np.array([self.model.body(f"object{s}").id for s in self.slots], int)
 
     def worlds(self, count: int) -> Worlds:
-        """The nominal world and ``count - 1`` perturbed ones, the same at every call."""
+        """The nominal world and ``count - 1`` perturbed ones, always the same."""
         models, states = [self.model], [self._full_state(self.model, self.qpos0)]
         noise = np.zeros((count, self.steps, self.model.nu))
         for k in range(1, count):

@@ -90,11 +90,11 @@ def train(recipe: RunRecipe, overrides: Collection[str] = ()) -> Path:
     Raises:
         RunError: the folder already holds a run.
     """
-    run_dir = default_run_dir(recipe)
+    kind, run_dir = task_of(recipe), default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
     check_writers(recipe)
     with interruptible():
-        task = task_of(recipe).open(recipe, run_dir)
+        task = kind.open(recipe, run_dir)
     with new_run(run_dir, dump_recipe(recipe)) as hold:
         return _train(task, hold, None, list(overrides), changed=False)
 

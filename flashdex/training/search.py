@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from flashdex.envs.physics.state_map import StateMap
 from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
@@ -270,8 +269,9 @@ class _Session:
         rollout = found.rollout
         rollout.env_steps = self.env_steps
         more = {"rung": found.order.rung, "core_s": round(found.core_s, 3)}
+        proof = found.certificate and found.certificate.counted(rollout)
         line, _ = self.ledger.record(
-            rollout, wall_s=self.wall_s, certificate=found.certificate, more=more
+            rollout, wall_s=self.wall_s, certificate=proof, more=more
         )
         self._note(line)
         hours = self.wall_s / 3600

@@ -141,13 +141,11 @@ class TrackingTask(Task):
     def open_ledger(
         self, run_dir: Path, *, on_gpu: bool = False, source: Source = "policy"
     ) -> Ledger:
-        """Note the motions, score the baselines, what is new of them; open the ledger."""
+        """Note the motions, score what is new of the baselines, open the ledger."""
         self._remember_motions(run_dir)
         baselines = score_baselines(self.builder, own_file(run_dir, BASELINES))
         trivial = baselines.trivial(self.recipe.train.criterion)
-        return open_ledger(
-            self.builder, run_dir, trivial, on_gpu=on_gpu, source=source
-        )
+        return open_ledger(self.builder, run_dir, trivial, on_gpu=on_gpu, source=source)
 
     def begin(self, start: SessionStart, state: dict[str, Any] | None) -> None:
         """Take in what a crash left in the ledger, and open recorder and scorer."""

@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from flashdex.rollouts.resimulation import (
-    load_simulation,
-    perturb,
-    resimulate,
+from flashdex.envs.scene.perturbation import (
+    Perturbation,
+    control_range,
+    perturb_objects,
 )
+from flashdex.rollouts.resimulation import load_simulation, perturb, resimulate
 from flashdex.rollouts.safety import (
     SafetyMonitor,
     geom_kinds,

@@ -82,8 +82,6 @@ class SearchConfig:
     """Cost of changes between knots, in standard deviations squared."""
     end_weight: float = number(1.0, low=0, high=1000)
     """Weight added to the last quarter of the horizon."""
-    enough: float = number(0.95, above=0, high=1)
-    """Share of the limits below which a plan's errors are good enough to stop."""
     budget_s: float = number(60.0, above=0, high=1e7)
     """Core-seconds of a motion; a rung that has begun is finished."""
     workers: int = number(0, low=0, high=1024)

@@ -1,7 +1,7 @@
 """Position targets under which the servos of the wrist follow the reference.
 
-A servo trails a target that moves, by ``M q'' + ... = kp (target - q) - kv q'``. Targets
-ahead of the reference make up for that; fingers carry little and need none.
+A servo trails a target that moves, by ``M q'' + ... = kp (target - q) - kv q'``.
+Targets ahead of the reference make up for that; fingers carry little and need none.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ _MORE: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("lift_ratio", "path_ratio"), (float, int, type(None))),
     "certified": (bool, type(None)),
     "completed": (bool,),
-    **dict.fromkeys(("gpu_s", "core_s"), (float, int)),
+    **dict.fromkeys(("gpu_s", "core_s", "attempt_s"), (float, int)),
     **dict.fromkeys(("engine", "source"), (str,)),
 }
 

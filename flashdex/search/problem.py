@@ -157,7 +157,7 @@ class Problem:
         return out
 
     def controls(self, actions: NDArray[np.float32], first: int) -> Array:
-        """Controls (N, H, nu) of actions (N, H, 2, J) from control step ``first`` on."""
+        """Controls (N, H, nu) of actions (N, H, 2, J) from step ``first`` on."""
         n, steps = actions.shape[:2]
         flat = torch.from_numpy(actions).reshape(n * steps, 2, -1)
         ref = self._target[first : first + steps].repeat(n, 1, 1)

@@ -178,8 +178,8 @@ class _Session:
         """Count an attempt: what it cost, and how near it came."""
         one = self.motions[line["motion"]]
         one.rung = max(one.rung, line.get("rung", -1))
-        one.core_s += line.get("core_s", 0.0)
-        self.core_s += line.get("core_s", 0.0)
+        one.core_s += line.get("attempt_s", 0.0)
+        self.core_s += line.get("attempt_s", 0.0)
         self.env_steps = max(self.env_steps, line["env_steps"])
         if line["completed"] and not is_unmoved(line):
             errors = line["errors"]
@@ -268,7 +268,12 @@ class _Session:
         self.env_steps += found.simulated
         rollout = found.rollout
         rollout.env_steps = self.env_steps
-        more = {"rung": found.order.rung, "core_s": round(found.core_s, 3)}
+        spent = round(found.core_s, 3)
+        more = {
+            "rung": found.order.rung,
+            "attempt_s": spent,
+            "core_s": round(self.core_s + spent, 3),
+        }
         proof = found.certificate and found.certificate.counted(rollout)
         line, _ = self.ledger.record(
             rollout, wall_s=self.wall_s, certificate=proof, more=more

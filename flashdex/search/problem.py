@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -93,12 +94,12 @@ class Problem:
         self.active = [i for i in range(2) if active[i]]
         self.num_joints = bank.num_joints
         rows = torch.full((self.steps,), row)
-        ref = bank.at(rows, torch.arange(self.steps) + 1)
-        self._target = ref["joint_target"]  # (S, 2, J)
+        ref: Any = bank.at(rows, torch.arange(self.steps) + 1)
+        self._target: Tensor = ref["joint_target"]  # (S, 2, J)
         self._range = stack_hands(hands, "joint_range")
         self.slots = [s for s, q in enumerate(bank.object_index[row]) if q >= 0]
-        self.ref_pos = ref["object_pos"][:, self.slots].double().numpy()
-        self.ref_quat = ref["object_quat"][:, self.slots].double().numpy()
+        self.ref_pos: Array = ref["object_pos"][:, self.slots].double().numpy()
+        self.ref_quat: Array = ref["object_quat"][:, self.slots].double().numpy()
         self.adr = np.array([scene.object_qpos(s) for s in self.slots], dtype=int)
         own = bank.has_object[row].tolist()
         self._own = [int(bank.hand_slot[row, i]) if own[i] else -1 for i in self.active]
@@ -223,7 +224,7 @@ class Problem:
         pose = states[..., columns]
         return Trial(pose[..., :3], pose[..., 3:], self._tips(sensors), states)
 
-    def play(self, actions: NDArray[np.float32]) -> dict[str, Array]:
+    def play(self, actions: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
         """What actions (S, 2, J) lead to in the untouched scene, step by step.
 
         Returns:

@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -278,7 +279,7 @@ class RunBuilder:
 
     def rollout_builder(
         self,
-        scenes: list[Scene],
+        scenes: Sequence[Scene] | Mapping[int, Scene],
         *,
         made_by: dict[str, Any] | None = None,
         provenance: dict[str, Any] | None = None,

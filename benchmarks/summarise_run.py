@@ -20,12 +20,14 @@ def summarise(run_dir: Path) -> dict[str, object]:
     conversions: dict[str, object] = {}
     for line in read_lines(run_dir / "conversions.jsonl"):
         if line["converted"] and line["motion"] not in conversions:
-            kept = ("env_steps", "wall_s", "errors", "certified", "verdict", "trivial")
+            kept = ("env_steps", "wall_s", "core_s", "errors", "certified")
+            kept += ("verdict", "trivial", "lift_ratio")
             conversions[line["motion"]] = {key: line.get(key) for key in kept}
     return {
         "env_steps": last["env_steps"],
         "minutes": round(60 * last["hours"], 2),
-        "updates": last["updates"],
+        "updates": last.get("updates"),
+        "core_s": last.get("search/core_s"),
         "converted": len(conversions),
         "motions": len(baselines["frozen_object"]),
         "certified": last["convert/certified"],

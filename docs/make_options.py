@@ -15,6 +15,7 @@ from flashdex.envs.config import EnvConfig, GymConfig
 from flashdex.envs.mdp.term import KINDS, registry
 from flashdex.recipe import GymRecipe, LoopConfig, Recipe
 from flashdex.recipe.schema import Expectation, RunRecipe
+from flashdex.search.config import SearchConfig
 
 PAGE = Path(__file__).parent / "options.md"
 HEAD = """# Every option
@@ -25,6 +26,9 @@ recipe is put together stands on the page [recipes](recipes.md).
 
 Metres, radians, seconds, kilograms, unless a unit is given.
 """
+SEARCH_NOTE = """`flashdex search RECIPE` looks for the actions of each motion alone
+([page](search.md)); of the recipe it uses `hand`, `motions`, `physics` and
+`train.criterion`."""
 GYM_NOTE = """With `task: gym` a recipe trains on a stock environment instead of
 motions ([page](gym.md))."""
 NAMED_NOTES = {
@@ -167,10 +171,17 @@ def gym_sections() -> list[str]:
     return [*head, note, "", *section("gym", GymConfig)]
 
 
+def search_sections() -> list[str]:
+    """Return what a recipe of the search has besides."""
+    head = ["## The search", "", plain(SEARCH_NOTE), ""]
+    return [*head, *section("search", SearchConfig)]
+
+
 def render() -> str:
     """Return the whole page."""
     expect = ["## expect", "", "A list; each entry promises one number.", ""]
-    lines = [*section("", Recipe), *expect, *table(Expectation), "", *gym_sections()]
+    lines = [*section("", Recipe), *expect, *table(Expectation), ""]
+    lines += [*search_sections(), *gym_sections()]
     return HEAD + "\n" + "\n".join(lines).rstrip() + "\n"
 
 

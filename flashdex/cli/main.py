@@ -183,6 +183,16 @@ def _add_run_verbs(
     )
     add_allow(verb)
 
+    verb = add(
+        "search", _search, "search for the actions of each motion, without a policy"
+    )
+    verb.add_argument("recipe", nargs="?", help="name or path")
+    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    verb.add_argument("--resume", type=path, metavar="RUN", help="continue a search")
+    verb.add_argument(
+        "--workers", metavar="N", help="processes, the same as search.workers=N"
+    )
+
     verb = add("evaluate", _evaluate, "roll every motion of a run out and score it")
     _add_run(verb)
     add_overrides(verb)
@@ -308,13 +318,40 @@ def _resume(args: argparse.Namespace) -> int:
     return 0
 
 
-def _show_run(run_dir: Path) -> bool:
+def _search(args: argparse.Namespace) -> int:
+    from flashdex.recipe.store import SEARCH_TASK
+
+    words = [*args.overrides, f"task={SEARCH_TASK}"]
+    if args.workers is not None:
+        words.append(f"search.workers={args.workers}")
+    if args.resume is not None:
+        if args.recipe is not None or args.workers is not None:
+            raise FlashdexError("a search goes on as it began: give --resume RUN alone")
+        with loading():
+            from flashdex.training.search import resume_search
+
+        _show_run(resume_search(args.resume), verb="search")
+        return 0
+    if args.recipe is None:
+        raise FlashdexError("give a recipe (see `flashdex ls`) or --resume RUN")
+    with loading():
+        from flashdex.recipe import SearchRecipe, compose, expect_kind
+
+        composed = compose(args.recipe, words)
+        recipe = expect_kind(composed, SearchRecipe, where="search")
+        from flashdex.training.search import search
+
+    _show_run(search(recipe, words), verb="search")
+    return 0
+
+
+def _show_run(run_dir: Path, *, verb: str = "train") -> bool:
     """Show what a run came to; False when a signal ended it, which is no time to."""
     from flashdex.reports.run.terminal import run_summary
     from flashdex.training.session import SIGNAL, ended_by
 
     if ended_by(run_dir) == SIGNAL:
-        say(f"stopped; go on with: flashdex train --resume {run_dir}")
+        say(f"stopped; go on with: flashdex {verb} --resume {run_dir}")
         return False
     say(run_summary(run_dir))
     return True

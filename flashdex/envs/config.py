@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
+from flashdex.envs.feedforward import Feedforward
 from flashdex.envs.mdp.assist import AssistConfig
 from flashdex.envs.mdp.resets import ResetNoise
 from flashdex.envs.mdp.term import default_mapping
@@ -34,9 +35,10 @@ class EnvConfig:
     """Largest wrist rotation residual, rad."""
     finger_scale: float = number(0.3, low=0, high=10)
     """Largest finger residual, rad (residual mode only)."""
-    wrist_lead: bool = False
-    """Wrist targets run ahead of the reference by the lag of their servos (velocity
-    feed-forward), playback's too. Fast recordings need it: 50 ms at 2 m/s is 10 cm."""
+    feedforward: Feedforward = "none"
+    """Where wrist targets stand before any action, playback's too: none on the
+    reference, lag ahead by what the servos trail a steady motion (50 ms at 2 m/s is
+    10 cm), inverse by all of their inverse dynamics."""
     wrist_lowpass_hz: float = number(5.0, low=0, high=10_000)
     """Cut-off of the filter on wrist actions, 1/s; 0 = no filter."""
     reference_offset: int = number(1, low=0, high=1)

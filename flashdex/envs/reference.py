@@ -21,7 +21,8 @@ class ReferenceBank(nn.Module):
     Every per-frame quantity lies side by side in one wide table; reading the state
     of N worlds is a single ``index_select`` and a few views. Quantities of "the
     object of a hand" are resolved here, once, so that no later code looks up slots. The
-    hands are there for the mapped keypoints.
+    hands are there for the mapped keypoints. ``targets`` (F, 2, J) make the servos
+    follow the joints, see ``reference_targets``; the joints themselves when None.
     """
 
     table: Tensor  # (F, all columns)
@@ -40,7 +41,10 @@ class ReferenceBank(nn.Module):
     com: Tensor  # object frame, m, (Q, 3)
 
     def __init__(
-        self, library: MotionLibrary, hands: dict[keys.Side, HandSpec]
+        self,
+        library: MotionLibrary,
+        hands: dict[keys.Side, HandSpec],
+        targets: Tensor | None = None,
     ) -> None:
         super().__init__()
         # Columns of the packed table and the shape they are read back with.
@@ -53,6 +57,8 @@ class ReferenceBank(nn.Module):
         rows = motions["object_index"].long()
         motion_of_frame = torch.repeat_interleave(torch.arange(len(start)), length)
         columns = self._columns(frames, slot[motion_of_frame], hands)
+        pos = columns["joint_pos"]
+        columns["joint_target"] = pos if targets is None else targets.float()
         self.register_buffer("table", self._pack(columns))
         self.register_buffer("future", _pack_future(columns))
         self.register_buffer("start", start)

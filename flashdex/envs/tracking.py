@@ -81,8 +81,6 @@ class TrackingEnv(EnvBase):
         hands: hand specs by side.
         config: environment part of the recipe.
         step_dt: control step, s.
-        lead_s: how far each joint's target runs ahead of the reference, s, (2, J);
-            zero when None.
         seed: of resets and motions.
         evaluation: no terminations, every world an attempt.
     """
@@ -95,7 +93,6 @@ class TrackingEnv(EnvBase):
         config: EnvConfig,
         *,
         step_dt: float,
-        lead_s: Tensor | None = None,
         seed: int = 0,
         evaluation: bool = False,
     ) -> None:
@@ -110,9 +107,8 @@ class TrackingEnv(EnvBase):
         self.attempt = torch.arange(n, device=device) < self.num_attempts
         self.kinematics = HandKinematics(hands).to(device)
         self.joint_range = stack_hands(hands, "joint_range").to(device)
-        self.lead_s = (torch.zeros(()) if lead_s is None else lead_s).to(device)
         context = TermContext(
-            *(bank, n, step_dt, self.lead_s, self.joint_range),
+            *(bank, n, step_dt, self.joint_range),
             tip_radius=stack_hands(hands, "tip_radius").to(device),
         )
         self.terms = TermManager(
@@ -310,7 +306,7 @@ class TrackingEnv(EnvBase):
         self._target = joint_target(
             self._filter,
             action[..., 6:],
-            self.leading_reference(ref),
+            ref["joint_target"],
             self.joint_range,
             wrist_scale=self._wrist_scale,
             finger_scale=self.config.finger_scale if residual else None,
@@ -318,10 +314,6 @@ class TrackingEnv(EnvBase):
         if self.target_override is not None:
             self._target = self.target_override(self)
         self.physics.step(self._target, self._wrench(ref))
-
-    def leading_reference(self, ref: TensorDictBase) -> Tensor:
-        """Reference joints ahead by the lag of the wrist servos, (N, 2, J)."""
-        return ref["joint_pos"] + self.lead_s * ref["joint_vel"]
 
     def _wrench(self, ref: TensorDictBase) -> ObjectWrench | None:
         """What acts on the objects besides contact and gravity; None is nothing."""

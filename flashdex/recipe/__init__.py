@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from flashdex.recipe.store import require_motions as require_motions
     from flashdex.recipe.store import task_of_run as task_of_run
     from flashdex.recipe.tasks import GymRecipe as GymRecipe
+    from flashdex.recipe.tasks import SearchRecipe as SearchRecipe
     from flashdex.recipe.tasks import expect_kind as expect_kind
 
 _PARTS = ("reader", "store", "run", "motions", "schema", "tasks", "check", "merge")

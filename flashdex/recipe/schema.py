@@ -63,7 +63,9 @@ class Recipe(RunRecipe):
     """
 
     task: Literal["retarget"] = "retarget"
-    """What is trained: motions; `gym` is the other kind, with keys of its own."""
+    """What is done: a policy is trained on motions; `search` looks for the actions of
+    each motion alone, `gym` trains on a stock environment; those have keys of their
+    own."""
     hand: str = "xhand"
     """Robot hand."""
     motions: MotionsConfig = dataclasses.field(default_factory=MotionsConfig)

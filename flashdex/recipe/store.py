@@ -21,7 +21,7 @@ from flashdex.errors import (
 )
 from flashdex.recipe.reader import parse_yaml, read_text, read_yaml
 
-DEFAULT_TASK, GYM_TASK = "retarget", "gym"
+DEFAULT_TASK, GYM_TASK, SEARCH_TASK = "retarget", "gym", "search"
 
 
 @dataclass(frozen=True)

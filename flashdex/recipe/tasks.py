@@ -16,7 +16,8 @@ from flashdex.errors import FlashdexError, nearest
 from flashdex.hands import known_hands
 from flashdex.recipe.run import LoopConfig
 from flashdex.recipe.schema import Expectation, Recipe, RunRecipe
-from flashdex.recipe.store import DEFAULT_TASK, GYM_TASK
+from flashdex.recipe.store import DEFAULT_TASK, GYM_TASK, SEARCH_TASK
+from flashdex.search.config import SearchConfig
 
 
 def find_conflicts(recipe: Recipe) -> list[str]:
@@ -200,6 +201,64 @@ def _hand_keys(algo: AlgoConfig) -> list[str]:
     ]
 
 
+@dataclass(frozen=True, kw_only=True)
+class SearchRecipe(Recipe):
+    """One search for the actions of motions, complete; learner and loop play no role.
+
+    Example:
+        >>> SearchRecipe(name="tiny", total_env_steps=1000).search.stride
+        8
+    """
+
+    task: Literal["search"] = "search"  # type: ignore[assignment]
+    """What is done: actions are searched for; `flashdex search` sets it."""
+    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
+    """Search."""
+
+    def in_action_space(self) -> SearchRecipe:
+        """The recipe whose environment has the bounds of the search as its actions.
+
+        So that stored actions mean what they mean in every run: residuals on targets
+        that lead the servos.
+        """
+        found, env = self.search, self.env
+        env = dataclasses.replace(
+            env,
+            finger_mode="residual",
+            wrist_pos_scale=found.wrist_pos_bound,
+            wrist_rot_scale=found.wrist_rot_bound,
+            finger_scale=found.finger_bound,
+            wrist_lowpass_hz=0.0,
+            feedforward="inverse",
+        )
+        return dataclasses.replace(self, env=env)
+
+
+def find_search_conflicts(recipe: SearchRecipe) -> list[str]:
+    """Return one line for each thing that does not fit together."""
+    checks = (_hand, _motions, _rate, _ladders)
+    return [problem for check in checks for problem in check(recipe)]
+
+
+def _ladders(recipe: SearchRecipe) -> list[str]:
+    found, problems = recipe.search, []
+    if recipe.physics.engine != "cpu":
+        problems.append(
+            f"physics.engine: the search steps MuJoCo C; '{recipe.physics.engine}' is "
+            "not available, use physics=cpu"
+        )
+    for name in ("ladder", "robust_ladder"):
+        for i, rung in enumerate(getattr(found, name)):
+            if rung.horizon < found.stride:
+                problems.append(
+                    f"search.{name}[{i}].horizon: {rung.horizon} steps are looked "
+                    f"ahead, and search.stride={found.stride} decided; look further"
+                )
+    if not found.ladder:
+        problems.append("search.ladder: empty; give at least one rung")
+    return problems
+
+
 R = TypeVar("R", bound=RunRecipe)
 
 
@@ -224,6 +283,11 @@ KINDS: dict[str, Kind] = {
     DEFAULT_TASK: Kind(
         root=Recipe,
         find_conflicts=find_conflicts,
+        make_base=lambda: {"env": {k: default_mapping(k) for k in TERM_KINDS}},
+    ),
+    SEARCH_TASK: Kind(
+        root=SearchRecipe,
+        find_conflicts=find_search_conflicts,
         make_base=lambda: {"env": {k: default_mapping(k) for k in TERM_KINDS}},
     ),
     GYM_TASK: Kind(root=GymRecipe, find_conflicts=find_gym_conflicts, make_base=dict),

@@ -9,19 +9,18 @@ from __future__ import annotations
 import json
 import math
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from flashdex.envs.scene.perturbation import PERTURBATION, Perturbation
 from flashdex.metrics.criteria import resolve_criterion
 from flashdex.metrics.criteria_table import CertificateVerdict, Verdict
 from flashdex.rollouts.findings import Finding, at, differences, short
 from flashdex.rollouts.resimulation import (
-    PERTURBATION,
-    Perturbation,
     Replay,
     Simulation,
     load_simulation,
@@ -65,6 +64,12 @@ class Certificate:
     perturbed: dict[str, Any]  # seed, sizes, runs, share that passed by criterion
     safety: dict[str, Any]  # penetration mm, force N, joint limits, warnings, NaN
     provenance: dict[str, Any]  # seed, env steps, hashes, hardware
+
+    def counted(self, rollout: Rollout) -> Certificate:
+        """The proof of the same rollout, whose env steps are known only now."""
+        identity = {**self.identity, "rollout_sha256": rollout.content_sha256}
+        provenance = {**self.provenance, "env_steps": rollout.env_steps}
+        return replace(self, identity=identity, provenance=provenance)
 
     def to_json(self) -> str:
         """JSON text; numbers that are not finite become null."""

@@ -15,6 +15,7 @@ from flashdex.errors import FlashdexError
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
 from flashdex.recipe import Recipe, RunRecipe, parse_recipe
 from flashdex.recipe.reader import parse_yaml
+from flashdex.recipe.store import DEFAULT_TASK, SEARCH_TASK
 from flashdex.rollouts.findings import Notes, at, is_date
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
@@ -44,6 +45,8 @@ BASELINE_NAMES = ("do_nothing", "kinematic_playback", "frozen_object")
 # of a recipe: what the baselines of a motion depend on
 OF_BASELINES = ("hand", "motions", "physics", "env")
 REASONS = ("budget", "all converted", "wall_limit_s", "signal", "error")
+REASONS += ("nothing left to try",)  # of a search
+SOURCES = {DEFAULT_TASK: "policy", SEARCH_TASK: "search"}
 CLOCK = 1e-3  # s, to which lines round the clock of a run
 Found = TypeVar("Found")
 
@@ -76,7 +79,7 @@ class Era:
     @property
     def budget(self) -> float:
         """Env steps that it may come to, with those of the last vector step."""
-        if not isinstance(self.recipe, Recipe):
+        if not isinstance(self.recipe, Recipe) or self.recipe.task == SEARCH_TASK:
             return math.inf
         return self.recipe.total_env_steps + self.recipe.env.num_envs
 
@@ -87,6 +90,7 @@ class Era:
             "seed": at(self.plain, "seed"),
             "engine": at(self.plain, "physics", "engine"),
             "criterion": at(self.plain, "train", "criterion"),
+            "source": SOURCES.get(at(self.plain, "task")),
         }
         return {key: value for key, value in found.items() if value is not None}
 
@@ -189,13 +193,16 @@ class RunClaims(Notes):
         """
         path, empty = own_file(self.run_dir, CONVERSIONS), list[dict[str, Any]]()
         lines = self._read(CONVERSIONS, lambda: read_ledger(path), empty)
-        wall_s = 0.0
+        wall_s = core_s = 0.0
         for number, line in enumerate(lines, start=1):
             where = f"line {number}"
             if line["wall_s"] < wall_s:
                 self.fault(where, "is out of order: its wall_s is below the one before")
             wall_s = line["wall_s"]
             self._line(where, line)
+            core_s += line.get("attempt_s", 0.0)
+            if abs(line.get("core_s", core_s) - core_s) > CLOCK * number:
+                self.fault(where, "core_s is not the sum of the attempts' core-seconds")
         if not self._sessions:
             self.fault("lines", "there are none", file=SESSIONS)
         self._clocks()

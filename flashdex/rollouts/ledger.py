@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
@@ -17,7 +17,7 @@ from flashdex.metrics.criteria import (
     stays_behind,
 )
 from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
-from flashdex.rollouts.certificate import PROVEN, certify
+from flashdex.rollouts.certificate import PROVEN, Certificate, certify
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.rollout import MAX_FILE, Rollout, limits_of
 from flashdex.system.arrays import hash_content
@@ -26,10 +26,11 @@ from flashdex.system.jsonl import append_line, check_keys, drop_cut_line, read_l
 from flashdex.system.names import check_name, check_names, file_stem
 from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
 
+Source = Literal["policy", "search"]
 _LOG = logging.getLogger(__name__)
 # what a line holds
 LINE: dict[str, type | tuple[type, ...]] = {
-    **dict.fromkeys(("motion", "criterion", "engine"), str),
+    **dict.fromkeys(("motion", "criterion", "engine", "source"), str),
     **dict.fromkeys(("converted", "completed"), bool),
     **dict.fromkeys(("env_steps", "frame", "seed"), int),
     **dict.fromkeys(("wall_s", "gpu_s"), float),
@@ -40,6 +41,8 @@ LINE: dict[str, type | tuple[type, ...]] = {
 }
 # and those that store a rollout, besides
 STORED = ("rollout", "verdict", "rollout_sha256", "certificate_sha256")
+# of a search: of its ladder; core-seconds of the attempt, and of the run so far
+SEARCHED = {"rung": int, "attempt_s": float, "core_s": float}
 
 
 def read_ledger(path: Path) -> list[dict[str, Any]]:
@@ -52,7 +55,8 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, start=1):
         check_name(line["motion"], what="motion", where=f"{path}: line {number}")
         more = {key: (str, type(None)) for key in STORED if key in line}
-        check_keys(line, more, path, number)
+        searched = SEARCHED if line["source"] == "search" else {}
+        check_keys(line, {**more, **searched}, path, number)
         errors = line["errors"]  # of a state that diverged they are not finite
         odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
         check_keys(errors, odd, path, number)
@@ -72,6 +76,7 @@ class Ledger(Tally):
 
     Seconds count as a GPU's where one steps the physics (``on_gpu``). Conversions get a
     certificate if ``certify``. ``trivial``: baselines that already pass a motion.
+    ``source`` is who finds the attempts.
     """
 
     def __init__(
@@ -85,18 +90,26 @@ class Ledger(Tally):
         on_gpu: bool = False,
         certify: bool = True,
         trivial: dict[str, list[str]] | None = None,
+        source: Source = "policy",
     ) -> None:
         check_names(names, what="motion")
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.path = run_dir, own_file(run_dir, CONVERSIONS)
         self.rollouts = own_folder(run_dir, ROLLOUTS)
         self.seed, self.engine, self.on_gpu = seed, engine, on_gpu
+        self.source = source
         self.certify, self.trivial = certify, trivial or {}
         drop_cut_line(self.path)
         super().__init__(names, criterion, read_ledger(self.path))  # earlier sessions
 
     def record(
-        self, rollout: Rollout, *, wall_s: float, is_own: bool = True
+        self,
+        rollout: Rollout,
+        *,
+        wall_s: float,
+        is_own: bool = True,
+        certificate: Certificate | None = None,
+        more: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], bool]:
         """Score one attempt, write its line and count it.
 
@@ -105,6 +118,9 @@ class Ledger(Tally):
             wall_s: seconds of the run so far.
             is_own: it was made here; a model that was found in a file is tried in a
                 child process first.
+            certificate: of the rollout, where it has been made already; one that is
+                robust may replace what is only certified.
+            more: entries of the line that its source adds.
 
         Returns:
             The line, and whether the motion is done by this attempt.
@@ -117,6 +133,8 @@ class Ledger(Tally):
             "gpu_s": round(wall_s, 3) if self.on_gpu else 0.0,
             "seed": self.seed,
             "engine": self.engine,
+            "source": self.source,
+            **(more or {}),
             "trivial": self._trivial(rollout),
         }
         before = self.conversions.get(name)
@@ -127,12 +145,15 @@ class Ledger(Tally):
             or self.moves_more(line, before)
             or (
                 self.certify
-                and not before["certified"]
                 and not self.moves_more(before, line)
+                and (not before["certified"] or _is_better(certificate, before))
             )
         )
         if line["converted"] and is_wanted:
-            line.update(self._store(rollout, line["errors"], is_own=is_own))
+            rollout.errors = json.dumps(line["errors"])
+            if certificate is None and self.certify:
+                certificate = _prove(rollout, is_own=is_own)
+            line.update(self._store(rollout, certificate))
         append_line(self.path, line)
         return line, self.count(line)
 
@@ -142,10 +163,9 @@ class Ledger(Tally):
         return [*self.trivial.get(rollout.motion, []), *unmoved]
 
     def _store(
-        self, rollout: Rollout, errors: dict[str, float], *, is_own: bool
+        self, rollout: Rollout, certificate: Certificate | None
     ) -> dict[str, Any]:
         """Store a rollout that passed; what its line says of the files."""
-        rollout.errors = json.dumps(errors)
         named = rollout_name(rollout.motion)
         path = own_file(self.run_dir, named)
         proof = own_file(self.run_dir, certificate_name(rollout.motion))
@@ -156,14 +176,7 @@ class Ledger(Tally):
         out: dict[str, Any] = {"rollout": named, "rollout_sha256": hash_content(path)}
         if not self.certify:
             return out
-        try:
-            xml = rollout.model_xml
-            model = mujoco.MjModel.from_xml_string(xml) if is_own else None
-            certificate = certify(rollout, model=model)
-        except (FlashdexError, ValueError) as error:
-            if is_of_machine(error):
-                raise
-            _LOG.warning("%s: not certified: %s", rollout.motion, error)
+        if certificate is None:
             return {**out, "certified": False, "verdict": "not_measured"}
         certificate.save(proof)
         verdict = certificate.verdict
@@ -225,6 +238,26 @@ class Ledger(Tally):
 
 COUNTERS = ("env_steps", "frame", "seed", "wall_s")
 ROUNDED = 1e-6  # m or rad, of the values in a line
+
+
+def _prove(rollout: Rollout, *, is_own: bool) -> Certificate | None:
+    try:
+        xml = rollout.model_xml
+        model = mujoco.MjModel.from_xml_string(xml) if is_own else None
+        return certify(rollout, model=model)
+    except (FlashdexError, ValueError) as error:
+        if is_of_machine(error):
+            raise
+        _LOG.warning("%s: not certified: %s", rollout.motion, error)
+        return None
+
+
+def _is_better(certificate: Certificate | None, before: dict[str, Any]) -> bool:
+    """A proof of robustness, against a line whose rollout has none."""
+    is_robust = certificate is not None and certificate.verdict == "robust"
+    return is_robust and before.get("verdict") != "robust"
+
+
 SPEED = "convert/per_hour"  # of a clock that went on between two readings
 SPEED_TOLERANCE = 0.05
 

@@ -15,6 +15,13 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from flashdex.envs.scene.perturbation import (
+    PERTURBATION,
+    Perturbation,
+    control_range,
+    perturb_model,
+    perturb_objects,
+)
 from flashdex.errors import RunError
 from flashdex.keys import FINGERS, SIDES
 from flashdex.metrics.criteria import score
@@ -214,24 +221,6 @@ def object_poses(sim: Simulation, qpos: np.ndarray) -> dict[str, np.ndarray | No
     return {"object_pos": pose[..., :3], "object_quat": pose[..., 3:]}
 
 
-@dataclass(frozen=True)
-class Perturbation:
-    """Sizes of the disturbances; they are part of the certificate's schema."""
-
-    object_pos: float = 2e-3  # first position, uniform per axis, m
-    object_rot: float = float(np.radians(2.0))  # about a random axis, uniform, rad
-    mass: tuple[float, float] = (0.8, 1.2)  # factor of mass and inertia, uniform
-    friction: tuple[float, float] = (0.8, 1.2)  # factor of all friction, uniform
-    ctrl_noise: float = 5e-3  # normal, std as a share of the actuator's range
-    # a slide's range counts at most as this much, m: a wrist that may travel metres
-    # would else be shaken by centimetres; the same for hinges, rad
-    ctrl_range_m: float = 0.4
-    ctrl_range_rad: float = float(np.pi)
-
-
-PERTURBATION = Perturbation()
-
-
 def perturb(
     sim: Simulation, sizes: Perturbation = PERTURBATION, *, seed: int, index: int
 ) -> Simulation:
@@ -240,69 +229,12 @@ def perturb(
     ``seed`` is the certificate's, ``index`` the number of the perturbed replay.
     """
     rng = np.random.default_rng([seed, index])
-    model = _perturb_model(sim, rng, sizes)
-    qpos0 = perturb_objects(sim, rng, sizes)
+    there = sim.object_adr >= 0
+    model = perturb_model(sim.model, sim.object_body[there], rng, sizes)
+    qpos0 = perturb_objects(sim.qpos0, sim.object_adr[there], rng, sizes)
     width = control_range(sim.model, sim.ctrl, sizes)
     noise = rng.normal(size=sim.ctrl.shape) * sizes.ctrl_noise * width
     return replace(sim, model=model, qpos0=qpos0, ctrl=sim.ctrl + noise)
-
-
-def _perturb_model(
-    sim: Simulation, rng: np.random.Generator, sizes: Perturbation
-) -> mujoco.MjModel:
-    """A copy of the model with other object masses and another friction."""
-    model = copy.deepcopy(sim.model)
-    for body in sim.object_body[sim.object_body >= 0]:
-        factor = rng.uniform(*sizes.mass)
-        tree = model.body_rootid == model.body_rootid[body]
-        model.body_mass[tree] *= factor
-        model.body_inertia[tree] *= factor
-    factor = rng.uniform(*sizes.friction)
-    model.geom_friction[:] *= factor
-    model.pair_friction[:] *= factor
-    # inverse weights of the solver follow from the masses
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
-
-
-def perturb_objects(
-    sim: Simulation, rng: np.random.Generator, sizes: Perturbation
-) -> np.ndarray:
-    """First positions with every object shifted and turned a little, (nq,)."""
-    qpos = np.array(sim.qpos0, dtype=np.float64)
-    for adr in sim.object_adr[sim.object_adr >= 0]:
-        shift = rng.uniform(-sizes.object_pos, sizes.object_pos, size=3)
-        axis = rng.normal(size=3)
-        angle = rng.uniform(-sizes.object_rot, sizes.object_rot)
-        turn, quat = np.empty(4), np.empty(4)
-        mujoco.mju_axisAngle2Quat(turn, axis / np.linalg.norm(axis), angle)
-        mujoco.mju_mulQuat(quat, turn, qpos[adr + 3 : adr + 7])
-        qpos[adr : adr + 3] += shift
-        qpos[adr + 3 : adr + 7] = quat
-    return qpos
-
-
-def control_range(
-    model: mujoco.MjModel, ctrl: np.ndarray, sizes: Perturbation
-) -> np.ndarray:
-    """Range of each actuator: its own, else its joint's, else the span of ctrl (T, nu).
-
-    Returns:
-        m or rad, at most the caps of ``sizes``, (nu,).
-    """
-    width = np.ptp(ctrl, axis=0)
-    for i in range(model.nu):
-        joint = int(model.actuator_trnid[i, 0])
-        drives_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-        if model.actuator_ctrllimited[i]:
-            width[i] = np.ptp(model.actuator_ctrlrange[i])
-        elif drives_joint and model.jnt_limited[joint]:
-            width[i] = np.ptp(model.jnt_range[joint])
-        if drives_joint:
-            is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-            cap = sizes.ctrl_range_m if is_slide else sizes.ctrl_range_rad
-            width[i] = min(width[i], cap)
-    return width
 
 
 def simulate(

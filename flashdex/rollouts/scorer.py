@@ -82,7 +82,7 @@ class ProcessScorer:
 
     def __init__(self, ledger: Ledger, spec: ScorerSpec, make: MakeScorer) -> None:
         self.ledger = ledger
-        self._pool = spawning_pool(1, _live_with_parent)  # one: lines keep their order
+        self._pool = spawning_pool(1, live_with_parent)  # one: lines keep their order
         self._opened: Future[None] | None = self._pool.submit(_open, spec, make)
         self._line: deque[Future[dict[str, Any]]] = deque()
 
@@ -146,7 +146,7 @@ Scorer = InlineScorer | ProcessScorer
 _opened: list[InlineScorer] = []  # of the scoring process
 
 
-def _live_with_parent() -> None:
+def live_with_parent() -> None:
     """First thing in the process: live and die with the loop."""
     # A signal to the whole group ends the loop, which ends this in order.
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):

@@ -15,27 +15,17 @@ from torch import Tensor
 
 from flashdex import keys
 from flashdex.envs.mdp.actions import joint_target, lowpass, lowpass_alpha
-from flashdex.envs.mdp.resets import draw_reset, reset_state
+from flashdex.envs.mdp.resets import first_state
 from flashdex.envs.physics.state_map import StateMap
 from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.scene import Scene, SceneLayout, rebuild_scene
-from flashdex.hands.gains import NUM_WRIST_JOINTS, servo_lag
+from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandSpec
 from flashdex.motions.library import MotionLibrary
 from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import Rollout
-
-
-def leading_time(hands: dict[keys.Side, HandSpec], recipe: Recipe) -> Tensor | None:
-    """Lag of the wrist servos, s, (2, J), zero for the fingers; None: no lead."""
-    if not recipe.env.wrist_lead:
-        return None
-    lags = [servo_lag(hands[s].gains[recipe.physics.gains]) for s in keys.SIDES]
-    lead = torch.tensor(np.stack(lags), dtype=torch.float32)
-    lead[:, NUM_WRIST_JOINTS:] = 0.0
-    return lead
 
 
 class _Scenes(Mapping[int, Scene]):
@@ -116,7 +106,8 @@ class Truth:
         row = self.bank.names.index(stored.motion)
         scene = self.scene(stored.motion, nodes=nodes)
         states = StateMap(self.library, self.hands, scene)
-        qpos0, qvel0, _ = states.write(torch.tensor([row]), **self._start(row))
+        start = first_state(self.bank, row, self._joint_range)
+        qpos0, qvel0, _ = states.write(torch.tensor([row]), **start)
         actions = torch.as_tensor(stored.actions)
         steps = len(actions)
         targets = self._targets(row, actions)
@@ -153,26 +144,11 @@ class Truth:
             motion_hash=self.library.motion_hash,
         )
 
-    def _start(self, row: int) -> dict[str, Tensor]:
-        """State of frame 0 without noise, batch 1."""
-        always = torch.tensor([True])
-        draw = draw_reset(
-            torch.tensor([row]),
-            *(always, always),
-            self.bank.length[[row]],
-            self.recipe.env.reset_noise,
-            self._joint_range,
-            torch.Generator(),
-        )
-        return reset_state(draw, self.bank, self._joint_range)
-
     def _targets(self, row: int, actions: Tensor) -> Tensor:
         """Joint targets of an attempt's actions, (T, 2, J)."""
         env, steps = self.recipe.env, len(actions)
         frames = torch.arange(steps) + 1
-        ref = self.bank.at(torch.full((steps,), row), frames)
-        lead = leading_time(self.hands, self.recipe)
-        leading = ref["joint_pos"] + (0.0 if lead is None else lead * ref["joint_vel"])
+        ref = self.bank.at(torch.full((steps,), row), frames, ("joint_target",))
         actions = torch.nan_to_num(actions).clamp(-1.0, 1.0)
         wrist, before = [], torch.zeros(1, 2, NUM_WRIST_JOINTS)
         alpha = lowpass_alpha(env.wrist_lowpass_hz, self.step_dt)
@@ -184,7 +160,7 @@ class Truth:
         return joint_target(
             torch.cat(wrist),
             actions[..., NUM_WRIST_JOINTS:],
-            leading,
+            ref["joint_target"],
             self._joint_range,
             wrist_scale=torch.tensor(scale),
             finger_scale=env.finger_scale if env.finger_mode == "residual" else None,

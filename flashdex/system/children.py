@@ -30,15 +30,18 @@ def safe_path() -> Iterator[None]:
             os.environ[_SAFE] = before
 
 
-def spawning_pool(workers: int, initializer: Callable[[], None]) -> ProcessPoolExecutor:
+def spawning_pool(
+    workers: int, initializer: Callable[..., None], *given: Any
+) -> ProcessPoolExecutor:
     """A pool of fresh processes: a fork would share torch's threads and the GPU.
 
     Args:
         workers: how many.
         initializer: what each runs first.
+        given: arguments of that.
     """
     with safe_path():  # a process that looks after semaphores begins
-        return ProcessPoolExecutor(workers, _Context(), initializer)
+        return ProcessPoolExecutor(workers, _Context(), initializer, given)
 
 
 class _Process(SpawnProcess):

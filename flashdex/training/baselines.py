@@ -61,8 +61,7 @@ def hold_first_pose(env: TrackingEnv) -> Tensor:
 
 def follow_reference(env: TrackingEnv) -> Tensor:
     """``kinematic_playback``: the retargeted joints as position targets."""
-    ref = env.bank.at(env.motion, env.frame, ("joint_pos", "joint_vel"))
-    return env.leading_reference(ref)
+    return env.bank.at(env.motion, env.frame, ("joint_target",))["joint_target"]
 
 
 BASELINES = {"do_nothing": hold_first_pose, "kinematic_playback": follow_reference}

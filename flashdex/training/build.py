@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from flashdex import keys
 from flashdex.algorithms import find_algorithm
 from flashdex.algorithms.base import Learner, TaskSpec
 from flashdex.datasets.source import SourceOptions, is_named
+from flashdex.envs.feedforward import reference_targets
 from flashdex.envs.physics.make import check_engine, engine_device, make_physics
 from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.scene import Scene, build_scenes
@@ -32,7 +34,7 @@ from flashdex.motions.pipeline.motion import MotionSettings
 from flashdex.motions.pipeline.prepare import Order, hash_inputs, run_order
 from flashdex.recipe import Recipe
 from flashdex.rollouts.build import RolloutBuilder
-from flashdex.rollouts.truth import leading_time, settings_of
+from flashdex.rollouts.truth import settings_of
 from flashdex.system.machine import versions
 
 JOINT_SLACK = 0.5  # m or rad beyond a hand's range that a reference may ask for
@@ -181,6 +183,15 @@ def _check_joints(library: MotionLibrary, hands: dict[keys.Side, HandSpec]) -> N
             )
 
 
+def make_bank(
+    recipe: Recipe, library: MotionLibrary, hands: dict[keys.Side, HandSpec]
+) -> ReferenceBank:
+    """Reference frames of the library, and the targets that the recipe starts from."""
+    kind = recipe.env.feedforward
+    targets = reference_targets(library, hands, recipe.physics, kind)
+    return ReferenceBank(library, hands, targets)
+
+
 @dataclass(frozen=True)
 class RunBuilder:
     """Builds the parts of a run: environment, learner, rollouts."""
@@ -225,7 +236,7 @@ class RunBuilder:
         if device is None:  # else somebody who steps no physics
             check_engine(library, recipe.physics)
             device = engine_device(recipe.physics)
-        return cls(recipe, library, hands, ReferenceBank(library, hands).to(device))
+        return cls(recipe, library, hands, make_bank(recipe, library, hands).to(device))
 
     @cached_property
     def scenes(self) -> list[Scene]:
@@ -256,7 +267,6 @@ class RunBuilder:
             self.hands,
             recipe.env,
             step_dt=self.step_dt,
-            lead_s=leading_time(self.hands, recipe),
             seed=recipe.seed if seed is None else seed,
             evaluation=evaluation,
         )
@@ -265,11 +275,11 @@ class RunBuilder:
         """The library as tensors on another device; ``bank`` itself on its own."""
         if device == self.bank.table.device:
             return self.bank
-        return ReferenceBank(self.library, self.hands).to(device)
+        return make_bank(self.recipe, self.library, self.hands).to(device)
 
     def rollout_builder(
         self,
-        scenes: list[Scene],
+        scenes: Sequence[Scene] | Mapping[int, Scene],
         *,
         made_by: dict[str, Any] | None = None,
         provenance: dict[str, Any] | None = None,

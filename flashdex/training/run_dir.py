@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDictBase
 
 from flashdex.algorithms.base import Learner
-from flashdex.errors import RecipeError, RunError, is_of_machine
-from flashdex.recipe import GymRecipe, RunRecipe, dump_recipe, load_recipe
+from flashdex.errors import FlashdexError, RecipeError, RunError, is_of_machine
+from flashdex.recipe import GymRecipe, RunRecipe, SearchRecipe, dump_recipe, load_recipe
 from flashdex.replay.disk import ReplayLog
 from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.files import RunHold
@@ -67,7 +67,16 @@ def default_run_dir(recipe: RunRecipe) -> Path:
 
 
 def task_of(recipe: RunRecipe) -> type[Task]:
-    """What a recipe trains."""
+    """What a recipe trains.
+
+    Raises:
+        FlashdexError: nothing, it is of a search.
+    """
+    if isinstance(recipe, SearchRecipe):
+        raise FlashdexError(
+            f"'{recipe.name}' has task: search, which trains nothing; use 'flashdex "
+            "search'"
+        )
     return GymTask if isinstance(recipe, GymRecipe) else TrackingTask
 
 
@@ -81,11 +90,11 @@ def train(recipe: RunRecipe, overrides: Collection[str] = ()) -> Path:
     Raises:
         RunError: the folder already holds a run.
     """
-    run_dir = default_run_dir(recipe)
+    kind, run_dir = task_of(recipe), default_run_dir(recipe)
     refuse_old_run(run_dir)  # at once, before motions are prepared
     check_writers(recipe)
     with interruptible():
-        task = task_of(recipe).open(recipe, run_dir)
+        task = kind.open(recipe, run_dir)
     with new_run(run_dir, dump_recipe(recipe)) as hold:
         return _train(task, hold, None, list(overrides), changed=False)
 

@@ -23,7 +23,7 @@ from flashdex.errors import RunError
 from flashdex.modules.layers import restore_generator
 from flashdex.recipe import Recipe, RunRecipe, dump_recipe, expect_kind
 from flashdex.replay.buffer import check_pinning
-from flashdex.rollouts.ledger import Ledger
+from flashdex.rollouts.ledger import Ledger, Source
 from flashdex.rollouts.recorder import Episode, EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, Scorer, ScorerSpec
 from flashdex.system.files import own_file
@@ -136,14 +136,16 @@ class TrackingTask(Task):
         """Score the baselines, what is new of them, and open the ledger."""
         self.env, self.run_dir = env, run_dir
         self.assist_epoch = AssistEpoch(env.terms.gates)
+        self.ledger = self.open_ledger(run_dir, on_gpu=env.device.type == "cuda")
+
+    def open_ledger(
+        self, run_dir: Path, *, on_gpu: bool = False, source: Source = "policy"
+    ) -> Ledger:
+        """Note the motions, score what is new of the baselines, open the ledger."""
         self._remember_motions(run_dir)
         baselines = score_baselines(self.builder, own_file(run_dir, BASELINES))
-        self.ledger = open_ledger(
-            self.builder,
-            run_dir,
-            baselines.trivial(self.recipe.train.criterion),
-            on_gpu=env.device.type == "cuda",
-        )
+        trivial = baselines.trivial(self.recipe.train.criterion)
+        return open_ledger(self.builder, run_dir, trivial, on_gpu=on_gpu, source=source)
 
     def begin(self, start: SessionStart, state: dict[str, Any] | None) -> None:
         """Take in what a crash left in the ledger, and open recorder and scorer."""
@@ -292,7 +294,12 @@ class TrackingTask(Task):
 
 
 def open_ledger(
-    builder: RunBuilder, run_dir: Path, trivial: dict[str, list[str]], *, on_gpu: bool
+    builder: RunBuilder,
+    run_dir: Path,
+    trivial: dict[str, list[str]],
+    *,
+    on_gpu: bool,
+    source: Source = "policy",
 ) -> Ledger:
     """The ledger of a run; ``trivial``: which baselines already pass a motion."""
     recipe = builder.recipe
@@ -305,6 +312,7 @@ def open_ledger(
         on_gpu=on_gpu,
         certify=recipe.train.certify,
         trivial=trivial,
+        source=source,
     )
 
 

@@ -41,15 +41,15 @@ PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal
 
 
 class Progress:
-    """A bar of env steps; without a terminal, a line in the log now and then."""
+    """A bar of env steps, or of what else is counted; a log without a terminal."""
 
-    def __init__(self, name: str, *, total: int, done: int) -> None:
-        self.total = total
+    def __init__(self, name: str, *, total: int, done: int, unit: str = "step") -> None:
+        self.total, self.unit = total, unit
         # Without a terminal tqdm would fill the log with carriage returns.
         self.bar = tqdm(
             total=total,
             initial=done,
-            unit="step",
+            unit=unit,
             unit_scale=True,
             desc=name,
             disable=None,
@@ -57,14 +57,14 @@ class Progress:
         )
         self._last_line = time.monotonic()
 
-    def show(self, note: str, *, env_steps: int, wall_s: float) -> None:
-        """Show what was achieved."""
+    def show(self, note: str, *, done: int, wall_s: float) -> None:
+        """Show what was achieved, by so many units."""
         self.bar.set_postfix_str(note)
         now = time.monotonic()
         if self.bar.disable and now - self._last_line >= PLAIN_LOG_S:
             self._last_line = now
             _LOG.info(
-                "%d of %d env steps, %s, %.0f s", env_steps, self.total, note, wall_s
+                "%d of %d %ss, %s, %.0f s", done, self.total, self.unit, note, wall_s
             )
 
 
@@ -202,7 +202,7 @@ class Trainer:
                 if self.task.record_due or now - self._last_log >= train.log_every_s:
                     self._write_log()
                     note = self.task.note
-                    progress.show(note, env_steps=self.env_steps, wall_s=self.wall_s)
+                    progress.show(note, done=self.env_steps, wall_s=self.wall_s)
                 if now - last_save >= train.checkpoint_every_s:
                     self._try_to_save()
                     last_save = time.monotonic()

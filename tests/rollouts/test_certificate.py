@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flashdex.envs.scene.perturbation import Perturbation
 from flashdex.errors import FlashdexError, UnknownNameError
 from flashdex.metrics.criteria_table import criterion_names
 from flashdex.rollouts.certificate import certify
-from flashdex.rollouts.resimulation import Perturbation
 from flashdex.rollouts.rollout import Rollout
 
 

@@ -6,14 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from flashdex.rollouts.resimulation import (
+from flashdex.envs.scene.perturbation import (
     Perturbation,
     control_range,
-    load_simulation,
-    perturb,
     perturb_objects,
-    resimulate,
 )
+from flashdex.rollouts.resimulation import load_simulation, perturb, resimulate
 from flashdex.rollouts.safety import (
     SafetyMonitor,
     geom_kinds,
@@ -113,7 +111,7 @@ def test_perturbed_poses_stay_within_their_sizes(rollout):
     shifts, turns = [], []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        qpos = perturb_objects(sim, rng, sizes)
+        qpos = perturb_objects(sim.qpos0, sim.object_adr, rng, sizes)
         assert qpos[0] == rollout.qpos0[0]  # the hand is left alone
         shifts.append(np.abs(qpos[1:4] - rollout.qpos0[1:4]).max())
         turns.append(2 * np.arccos(np.clip(abs(qpos[4]), 0, 1)))

@@ -127,10 +127,10 @@ def test_a_session_pays_for_what_changed_only(make_bench, hands, tmp_path, rolle
         ({"num_envs": 3}, False),
         ({"rewards": {}}, False),
         ({"train": {"criterion": "sr_mt"}}, True),
-        ({"wrist_lead": True}, True),
+        ({"feedforward": "lag"}, True),
         ({"max_seconds": 0.3}, True),
     ],
-    ids=["network", "worlds", "rewards", "criterion", "lead", "length"],
+    ids=["network", "worlds", "rewards", "criterion", "feedforward", "length"],
 )
 def test_an_override_pays_for_baselines_that_it_changes(
     make_bench, tmp_path, rolled, fields, is_paid

@@ -24,6 +24,8 @@ def lowpass(previous: Tensor, action: Tensor, fresh: Tensor, *, alpha: float) ->
 
     In ``fresh`` worlds, (N,) bool, which were just reset, the action passes through.
     """
+    if alpha >= 1.0:  # not p + (a - p), which rounds
+        return action
     filtered = previous + alpha * (action - previous)
     return torch.where(fresh[:, None, None], action, filtered)
 

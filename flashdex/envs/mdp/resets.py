@@ -78,6 +78,25 @@ def reset_state(
     }
 
 
+def first_state(
+    bank: ReferenceBank, row: int, joint_range: Tensor
+) -> dict[str, Tensor]:
+    """The state that every attempt at a motion starts from, batch 1.
+
+    See ``reset_state``; frame 0, without noise.
+    """
+    always = torch.tensor([True])
+    draw = draw_reset(
+        torch.tensor([row]),
+        *(always, always),
+        bank.length[[row]],
+        ResetNoise(),
+        joint_range,
+        torch.Generator(),
+    )
+    return reset_state(draw, bank, joint_range)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResetNoise:
     """Standard deviations of the start state around the reference."""

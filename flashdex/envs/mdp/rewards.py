@@ -196,7 +196,7 @@ def fingertip_pos_error_exp(
 
 def _target_and_reference(step: Step) -> tuple[Tensor, Tensor, Tensor]:
     lower, upper = step.context.joint_range.unbind(-1)
-    return step.target, step.leading_joint_pos, upper - lower
+    return step.target, step.ref["joint_target"], upper - lower
 
 
 @reward("behaviour_cloning", weight=0.3, inputs=_target_and_reference, gate="cloning")

@@ -18,7 +18,6 @@ class TermContext:
     bank: ReferenceBank  # reference frames and object tables
     num_envs: int  # worlds N
     step_dt: float  # control step, s
-    lead_s: Tensor  # how far targets run ahead of the reference, s, (2, J) or ()
     joint_range: Tensor  # lower and upper limits, (2, J, 2)
     tip_radius: Tensor  # m, (2, 5)
 
@@ -60,11 +59,6 @@ class Step:
     def object_row(self) -> Tensor:
         """Row of each hand's object in the tables, (N, 2) int64."""
         return self.bank.hand_object[self.motion]
-
-    @property
-    def leading_joint_pos(self) -> Tensor:
-        """Reference joints ahead by the lag of the wrist servos, (N, 2, J)."""
-        return self.ref["joint_pos"] + self.context.lead_s * self.ref["joint_vel"]
 
 
 @dataclass

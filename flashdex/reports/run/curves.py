@@ -43,10 +43,12 @@ def conversion_charts(
             y_range=(0.0, float(max(total, 1))),
         )
 
-    return [
-        chart("env_steps", 1.0, run.env_steps, STEPS),
-        chart("wall_s", seconds, run.wall_s / seconds, f"{unit} of training"),
-    ]
+    charts = [chart("env_steps", 1.0, run.env_steps, STEPS)]
+    if "core_s" in next(iter(run.attempts), {}):  # of a search
+        end = run.attempts[-1]["core_s"] / 60
+        return [*charts, chart("core_s", 60.0, end, "core-minutes of search")]
+    label = f"{unit} of training"
+    return [*charts, chart("wall_s", seconds, run.wall_s / seconds, label)]
 
 
 def _steps(

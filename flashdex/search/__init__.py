@@ -1,0 +1,1 @@
+"""Sampling-based trajectory optimisation, one motion at a time, in its own scene."""

@@ -1,0 +1,93 @@
+"""Configuration of the search."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from flashdex.system.fields import number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rung:
+    """One setting of the ladder: what a pass over a motion may cost."""
+
+    samples: int = number(16, low=2, high=100_000)
+    """Sequences of actions tried at once."""
+    rounds: int = number(1, low=1, high=1000)
+    """Times that they are drawn anew around the best, ever closer."""
+    horizon: int = number(24, low=2, high=10_000)
+    """Control steps looked ahead."""
+    worlds: int = number(1, low=1, high=64)
+    """Worlds each sequence is tried in: the nominal one, and perturbed ones."""
+    spread: float = number(1.0, above=0, high=100)
+    """Factor of all noise."""
+
+
+def _ladder() -> list[Rung]:
+    return [
+        Rung(samples=16, rounds=1, horizon=24),
+        Rung(samples=24, rounds=2, horizon=24),
+        Rung(samples=48, rounds=3, horizon=30),
+        Rung(samples=64, rounds=4, horizon=36),
+        Rung(samples=96, rounds=4, horizon=36, spread=1.5),
+    ]
+
+
+def _robust_ladder() -> list[Rung]:
+    return [
+        Rung(samples=16, rounds=1, horizon=24, worlds=4),
+        Rung(samples=24, rounds=2, horizon=24, worlds=4),
+        Rung(samples=32, rounds=3, horizon=30, worlds=6),
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """Search for the actions of one motion after the other, without a policy.
+
+    Lengths are m, rad and control steps. The bounds are the scales of the actions that
+    are stored: a run of the search has them as ``env.wrist_pos_scale`` and so on.
+    """
+
+    wrist_pos_bound: float = number(0.03, above=0, high=1)
+    """Largest wrist position residual, m."""
+    wrist_rot_bound: float = number(0.2, above=0, high=3)
+    """Largest wrist rotation residual, rad."""
+    finger_bound: float = number(0.5, above=0, high=3)
+    """Largest finger residual, rad."""
+    wrist_pos_noise: float = number(0.008, low=0, high=1)
+    """Standard deviation of the wrist's position, m."""
+    wrist_rot_noise: float = number(0.05, low=0, high=3)
+    """Of its rotation, rad."""
+    finger_noise: float = number(0.12, low=0, high=3)
+    """Of each finger joint, rad."""
+    squeeze_noise: float = number(0.12, low=0, high=3)
+    """Of all fingers of a hand closing together, rad."""
+    constant_share: float = number(0.7, low=0, high=1)
+    """Share of the noise that is the same over the whole horizon."""
+    anneal: float = number(0.6, above=0, high=1)
+    """Factor of the noise from round to round."""
+    elite: int = number(6, low=1, high=10_000)
+    """Best samples that the next round is drawn around."""
+    stride: int = number(8, low=1, high=10_000)
+    """Control steps that are decided before looking ahead again."""
+    knot: int = number(4, low=1, high=1000)
+    """Control steps between knots; actions are linear between them."""
+    tip_weight: float = number(0.3, low=0, high=1000)
+    """Cost of fingertips that leave the place on the object where they belong."""
+    residual_weight: float = number(0.05, low=0, high=1000)
+    """Cost of actions, squared."""
+    smooth_weight: float = number(0.02, low=0, high=1000)
+    """Cost of changes between knots, in standard deviations squared."""
+    end_weight: float = number(1.0, low=0, high=1000)
+    """Weight added to the last quarter of the horizon."""
+    budget_s: float = number(60.0, above=0, high=1e7)
+    """Core-seconds of a motion; a rung that has begun is finished."""
+    workers: int = number(0, low=0, high=1024)
+    """Processes, one motion each at a time; 0 = one a core."""
+    ladder: list[Rung] = dataclasses.field(default_factory=_ladder)
+    """Settings tried in turn, cheapest first, until a plan passes."""
+    robust_ladder: list[Rung] = dataclasses.field(default_factory=_robust_ladder)
+    """Those tried then, in several worlds, until a plan survives perturbations, too;
+    empty = one that passes is enough."""

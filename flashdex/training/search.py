@@ -1,0 +1,377 @@
+"""Runs of the search: motions over processes, what they find in the run's ledger."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import time
+from collections.abc import Collection
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from flashdex.envs.physics.state_map import StateMap
+from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
+from flashdex.errors import FlashdexError, RunError
+from flashdex.metrics.tally import is_unmoved
+from flashdex.recipe import SearchRecipe, dump_recipe, expect_kind
+from flashdex.rollouts.certificate import Certificate, certify
+from flashdex.rollouts.ledger import Ledger, read_ledger
+from flashdex.rollouts.recorder import Episode
+from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.scorer import live_with_parent
+from flashdex.search.config import Rung, SearchConfig
+from flashdex.search.costs import ErrorLimits
+from flashdex.search.plan import Planner
+from flashdex.search.problem import Problem
+from flashdex.system.children import spawning_pool
+from flashdex.system.files import RunHold
+from flashdex.system.run_files import (
+    check_run,
+    check_sessions,
+    hold_run,
+    new_run,
+    refuse_old_run,
+    remove_temporaries,
+    reported,
+)
+from flashdex.training.build import RunBuilder
+from flashdex.training.logging import MetricLog, check_writers
+from flashdex.training.run_dir import load_run_recipe
+from flashdex.training.session import (
+    SIGNAL,
+    StopSignals,
+    begin_session,
+    end_session,
+    interruptible,
+)
+from flashdex.training.tracking import TrackingTask
+from flashdex.training.trainer import Progress
+
+_LOG = logging.getLogger(__name__)
+KEPT = 4  # problems that a worker keeps
+WAIT_S = 0.5  # between looks at signals
+
+
+def search(recipe: SearchRecipe, overrides: Collection[str] = ()) -> Path:
+    """Search for the motions of a recipe from the beginning; return the run directory.
+
+    Args:
+        recipe: composed with ``task=search``.
+        overrides: ``key=value`` words it was composed with, for the run's records.
+
+    Raises:
+        RunError: the folder already holds a run.
+    """
+    recipe = recipe.in_action_space()
+    named = f"runs/{recipe.name}-search-s{recipe.seed}"
+    run_dir = Path(recipe.run_dir or named)
+    refuse_old_run(run_dir)
+    check_writers(recipe)
+    with interruptible():
+        task = TrackingTask(RunBuilder.from_recipe(recipe))
+    with new_run(run_dir, dump_recipe(recipe)) as hold:
+        return _run(task, hold, list(overrides))
+
+
+def resume_search(run: str | Path) -> Path:
+    """Continue a search where it stopped: what its ledger holds is not done again.
+
+    Raises:
+        RunError: another process is at it, or the run is of another kind.
+    """
+    run_dir = Path(run)
+    recipe = expect_kind(load_run_recipe(run_dir), SearchRecipe, where=str(run_dir))
+    check_writers(recipe)
+    with hold_run(run_dir) as hold:
+        check_run(run_dir)
+        check_sessions(run_dir)
+        with reported(run_dir):
+            remove_temporaries(run_dir)
+        with interruptible():
+            task = TrackingTask(RunBuilder.from_recipe(recipe))
+        task.check_inputs(run_dir)
+        return _run(task, hold, [])
+
+
+def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
+    run_dir, why = hold.path, "error"
+    with reported(run_dir):
+        ledger = task.open_ledger(run_dir, source="search")
+        lines = read_ledger(ledger.path)
+        done = lines[-1]["env_steps"] if lines else 0
+        start = begin_session(run_dir, env_steps=done, wall_s=0.0, overrides=overrides)
+        ledger.adopt(wall_s=start.wall_s)
+        log = MetricLog(run_dir, task.recipe)
+        session = _Session(task, ledger, log, hold, start.run, start.wall_s)
+        try:
+            why = session.run()
+        finally:
+            log.close()
+            counters = {"env_steps": session.env_steps, "wall_s": session.wall_s}
+            end_session(run_dir, why, **counters)
+    _LOG.info("ended after %.0f core-seconds: %s", session.core_s, why)
+    return run_dir
+
+
+@dataclass
+class _Progress:
+    """What has been tried of one motion."""
+
+    rung: int = -1  # the last one that was tried
+    core_s: float = 0.0
+    miss: float = float("inf")  # least worst error of a whole plan, in limits
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What a worker is asked for."""
+
+    row: int
+    rung: int  # in the ladder, and the robust one behind it
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What came of it."""
+
+    order: _Order
+    rollout: Rollout
+    certificate: Certificate | None  # of one that passes
+    core_s: float
+    simulated: int  # control steps, of all worlds
+
+
+@dataclass
+class _Session:
+    """One session of a search; the workers plan, this process keeps the files."""
+
+    task: TrackingTask
+    ledger: Ledger
+    log: MetricLog
+    hold: RunHold
+    run_id: str
+    wall_s: float  # of the run when the session began, then so far
+    env_steps: int = 0
+    core_s: float = 0.0
+    motions: dict[str, _Progress] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.recipe = expect_kind(self.task.recipe, SearchRecipe, where="search")
+        self.search: SearchConfig = self.recipe.search
+        self.rungs = [*self.search.ladder, *self.search.robust_ladder]
+        self.limits = ErrorLimits.of(self.recipe.train.criterion)
+        self.names = self.task.builder.bank.names
+        self.motions = {name: _Progress() for name in self.names}
+        for line in read_ledger(self.ledger.path):
+            if line["motion"] in self.motions:
+                self._note(line)
+        self._began = time.monotonic() - self.wall_s
+
+    def _note(self, line: dict[str, Any]) -> None:
+        """Count an attempt: what it cost, and how near it came."""
+        one = self.motions[line["motion"]]
+        one.rung = max(one.rung, line.get("rung", -1))
+        one.core_s += line.get("attempt_s", 0.0)
+        self.core_s += line.get("attempt_s", 0.0)
+        self.env_steps = max(self.env_steps, line["env_steps"])
+        if line["completed"] and not is_unmoved(line):
+            errors = line["errors"]
+            pos, rot = (errors.get(f"object_{k}", 9.0) for k in ("pos", "rot"))
+            worst = max(pos / self.limits.pos, rot / self.limits.rot)
+            one.miss = min(one.miss, worst)
+
+    def _next(self, busy: set[str]) -> _Order | None:
+        """The cheapest rung that is left, of it the motion that came nearest."""
+        found = []
+        for row, name in enumerate(self.names):
+            one, before = self.motions[name], self.ledger.conversions.get(name)
+            if name in busy or one.core_s >= self.search.budget_s:
+                continue
+            rung, last = one.rung + 1, len(self.search.ladder)
+            if before is not None and not is_unmoved(before):
+                if before.get("verdict") == "robust":
+                    continue
+                rung, last = max(rung, last), len(self.rungs)
+            if rung < last:
+                found.append((rung, one.miss, row))
+        rung, _, row = min(found, default=(0, 0.0, -1))
+        return None if row < 0 else _Order(row, rung)
+
+    def _end_reason(self) -> str:
+        limit = self.recipe.train.wall_limit_s
+        if self.env_steps >= self.recipe.total_env_steps:
+            return "budget"
+        if limit is not None and self.wall_s > limit:
+            return "wall_limit_s"
+        return ""
+
+    def run(self) -> str:
+        """Search until nothing is left to try, or something ends it; return why."""
+        count = self.search.workers or len(os.sched_getaffinity(0))
+        count = max(1, min(count, len(self.names)))
+        progress = Progress(
+            self.recipe.name,
+            total=len(self.names),
+            done=len(self.ledger.done),
+            unit="motion",
+        )
+        provenance = {**self.task.provenance, "run": self.run_id}
+        pool = spawning_pool(count, _open_worker, self._worker_recipe(), provenance)
+        flying: dict[Future[_Found], str] = {}
+        try:
+            with StopSignals() as stop:
+                while True:
+                    why = SIGNAL if stop.requested else self._end_reason()
+                    while not why and len(flying) < count:
+                        order = self._next(set(flying.values()))
+                        if order is None:
+                            break
+                        flying[pool.submit(_work, order)] = self.names[order.row]
+                    if why or not flying:
+                        return why or "nothing left to try"
+                    done, _ = wait(flying, WAIT_S, FIRST_COMPLETED)
+                    for future in done:
+                        del flying[future]
+                        self._take(future.result(), progress)
+        except BrokenProcessPool as error:
+            raise RunError(
+                "a process of the search has died. Was it killed for memory? Use fewer "
+                "with search.workers=1, and go on with 'flashdex search --resume "
+                f"{self.hold.path}'."
+            ) from error
+        finally:
+            progress.bar.close()
+            _end(pool)
+
+    def _worker_recipe(self) -> SearchRecipe:
+        """The recipe with the library that is in use: workers prepare nothing."""
+        library = str(self.task.builder.library.path)
+        motions = dataclasses.replace(self.recipe.motions, library=library)
+        return dataclasses.replace(self.recipe, motions=motions)
+
+    def _take(self, found: _Found, progress: Progress) -> None:
+        """Write what a worker found; the run's clock and counters go on."""
+        self.hold.check()
+        self.wall_s = time.monotonic() - self._began
+        self.env_steps += found.simulated
+        rollout = found.rollout
+        rollout.env_steps = self.env_steps
+        spent = round(found.core_s, 3)
+        more = {
+            "rung": found.order.rung,
+            "attempt_s": spent,
+            "core_s": round(self.core_s + spent, 3),
+        }
+        proof = found.certificate and found.certificate.counted(rollout)
+        line, _ = self.ledger.record(
+            rollout, wall_s=self.wall_s, certificate=proof, more=more
+        )
+        self._note(line)
+        hours = self.wall_s / 3600
+        self.log.write(
+            {
+                "env_steps": self.env_steps,
+                "hours": hours,
+                "search/core_s": self.core_s,
+                "search/rung": found.order.rung,
+                **self.ledger.metrics(hours),
+            }
+        )
+        progress.bar.n = len(self.ledger.done)
+        note = f"{self.ledger.note}, {self.core_s:.0f} core-s"
+        progress.show(note, done=progress.bar.n, wall_s=self.wall_s)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """End the workers at once: what they are at is done again after a resume."""
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Worker:
+    """Problems of a recipe's motions, in a process of its own."""
+
+    def __init__(self, recipe: SearchRecipe, provenance: dict[str, str]) -> None:
+        self.recipe = recipe
+        self.builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
+        self.layout = SceneLayout.of(self.builder.library)
+        self.limits = ErrorLimits.of(recipe.train.criterion)
+        self.provenance = provenance
+        self.problem = lru_cache(KEPT)(self._problem)
+
+    def _problem(self, row: int) -> Problem:
+        builder, recipe = self.builder, self.recipe
+        scene = rebuild_scene(
+            builder.library, row, builder.hands, recipe.physics, self.layout, nodes=0
+        )
+        return Problem(
+            builder.bank,
+            builder.hands,
+            StateMap(builder.library, builder.hands, scene),
+            scene,
+            row,
+            env=recipe.env,
+            decimation=recipe.physics.decimation,
+        )
+
+    def work(self, order: _Order) -> _Found:
+        """Plan one motion by one rung, score it, and certify what passes."""
+        begun, search = time.process_time(), self.recipe.search
+        problem = self.problem(order.row)
+        before = problem.simulated
+        rungs: list[Rung] = [*search.ladder, *search.robust_ladder]
+        grace = round(0.25 * self.builder.bank.fps)
+        plan = Planner(
+            problem,
+            search,
+            rungs[order.rung],
+            limits=self.limits,
+            grace=grace,
+            seed=[self.recipe.seed, order.row, order.rung],
+        ).run()
+        episode = Episode(
+            env=0,
+            env_steps=0,
+            steps=problem.play(plan.actions),
+            qpos0=problem.qpos0,
+            qvel0=problem.qvel0,
+            motion=order.row,
+            frame=len(plan.actions),
+            causes={} if plan.is_whole else {"given_up": problem.is_active},
+        )
+        builder = self.builder.rollout_builder(
+            {order.row: problem.scene}, provenance=self.provenance
+        )
+        rollout = builder.build(episode)
+        summary = rollout.summary(self.recipe.train.criterion)
+        certificate = None
+        if summary["converted"] and self.recipe.train.certify:
+            rollout.errors = json.dumps(summary["errors"])
+            certificate = certify(rollout, model=problem.scene.model)
+        spent = time.process_time() - begun
+        return _Found(order, rollout, certificate, spent, problem.simulated - before)
+
+
+_worker: list[_Worker] = []  # of this process
+
+
+def _open_worker(recipe: SearchRecipe, provenance: dict[str, str]) -> None:
+    live_with_parent()
+    torch.set_num_threads(1)
+    _worker.append(_Worker(recipe, provenance))
+
+
+def _work(order: _Order) -> _Found:
+    try:
+        return _worker[0].work(order)
+    except FlashdexError as error:
+        raise RunError(str(error)) from None  # others may not travel between processes

@@ -1,0 +1,142 @@
+"""Runs of the search: conversions that verify, and nothing done twice or lost."""
+
+import dataclasses
+
+import pytest
+
+from flashdex.cli.main import main
+from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.errors import FlashdexError
+from flashdex.recipe import LoggerConfig, MotionsConfig, SearchRecipe, validate
+from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
+from flashdex.search.config import Rung, SearchConfig
+from flashdex.system.run_files import read_metrics, read_sessions
+from flashdex.training import search as searching
+from flashdex.training.loaded import verify
+from flashdex.training.run_dir import train
+from flashdex.training.search import resume_search, search
+
+CHEAP = Rung(samples=6, rounds=1, horizon=12)
+LADDERS = SearchConfig(workers=1, ladder=[CHEAP], robust_ladder=[CHEAP])
+
+
+@pytest.fixture
+def recipe(library, tmp_path):
+    return validate(
+        SearchRecipe(
+            name="tiny",
+            total_env_steps=10**6,
+            run_dir=str(tmp_path / "run"),
+            motions=MotionsConfig(library=str(library.path)),
+            physics=PhysicsConfig(num_threads=1),
+            search=LADDERS,
+            logger=LoggerConfig(),
+        )
+    )
+
+
+def only(recipe, *names):
+    motions = dataclasses.replace(recipe.motions, select=list(names))
+    return dataclasses.replace(recipe, motions=motions)
+
+
+@pytest.fixture
+def inline(monkeypatch):
+    """Work in this process: a worker of its own takes seconds to begin."""
+    from concurrent.futures import Future
+
+    class Pool:
+        _processes = None
+
+        def __init__(self, count, begin, *given):
+            searching._worker[:] = [searching._Worker(*given)]
+
+        def submit(self, work, order):
+            future = Future()
+            future.set_result(work(order))
+            return future
+
+        def shutdown(self, **kwargs):
+            searching._worker.clear()
+
+    monkeypatch.setattr(searching, "spawning_pool", Pool)
+
+
+def test_a_search_leaves_a_run_that_verifies(recipe, inline):
+    run = search(recipe)
+    lines = read_ledger(run / CONVERSIONS)
+    assert {line["motion"] for line in lines} == {"right_box", "left_ball", "both"}
+    assert {line["source"] for line in lines} == {"search"}
+    assert any(line["certified"] for line in lines)
+    assert all(line["attempt_s"] > 0 for line in lines)
+    steps = [line["env_steps"] for line in lines]
+    assert steps == sorted(set(steps))
+    found = verify(run)
+    assert found.holds, found.findings
+    last = read_metrics(run)[-1]
+    assert last["search/core_s"] == pytest.approx(sum(x["attempt_s"] for x in lines))
+    assert last["search/core_s"] == pytest.approx(lines[-1]["core_s"], abs=1e-2)
+    assert last["convert/attempts"] == len(lines)
+
+
+def test_a_search_goes_on_where_it_stopped(recipe, inline, monkeypatch):
+    """What a killed run has in its ledger is not done again; the end is the same."""
+    recipe = only(recipe, "right_box", "left_ball")
+    whole = search(dataclasses.replace(recipe, run_dir=recipe.run_dir + "-whole"))
+    wanted = [
+        (x["motion"], x["rung"], x["errors"]) for x in read_ledger(whole / CONVERSIONS)
+    ]
+    take = searching._Session._take
+    taken = []
+
+    def dying(self, found, progress):
+        if len(taken) == 1:
+            raise KeyboardInterrupt
+        taken.append(found.order)
+        take(self, found, progress)
+
+    monkeypatch.setattr(searching._Session, "_take", dying)
+    with pytest.raises(KeyboardInterrupt):
+        search(recipe)
+    monkeypatch.setattr(searching._Session, "_take", take)
+    run = resume_search(recipe.run_dir)
+    found = [
+        (x["motion"], x["rung"], x["errors"]) for x in read_ledger(run / CONVERSIONS)
+    ]
+    assert sorted(found, key=str) == sorted(wanted, key=str)
+    assert verify(run).holds
+    assert resume_search(run) == run  # nothing is left
+    assert len(read_ledger(run / CONVERSIONS)) == len(found)
+    assert read_sessions(run)[-1]["why"] == "nothing left to try"
+
+
+def test_a_search_is_no_run_to_train_on(recipe, inline, capsys):
+    with pytest.raises(FlashdexError, match="flashdex search"):
+        train(recipe)
+    spent = dataclasses.replace(LADDERS, budget_s=1e-6)
+    run = search(dataclasses.replace(only(recipe, "right_box"), search=spent))
+    assert main(["train", "--resume", str(run)]) == 2
+    assert "flashdex search" in capsys.readouterr().err
+
+
+def test_a_run_of_a_policy_is_no_search_to_go_on(converted_run):
+    with pytest.raises(FlashdexError, match="task: search"):
+        resume_search(converted_run)
+
+
+def test_workers_search_in_processes_of_their_own(recipe):
+    ladders = dataclasses.replace(LADDERS, robust_ladder=[])
+    run = search(dataclasses.replace(only(recipe, "right_box"), search=ladders))
+    (line,) = read_ledger(run / CONVERSIONS)
+    assert line["motion"] == "right_box"
+    assert verify(run).holds
+
+
+def test_the_command_composes_a_recipe_for_the_search(capsys):
+    words = ["search", "quickstart", "search.ladder=[]", "physics=warp"]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert "search.ladder: empty" in told
+    assert "physics.engine" in told
+    assert main(["train", "quickstart", "search.stride=4"]) == 2
+    assert "task: search" in capsys.readouterr().err

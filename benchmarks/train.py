@@ -25,7 +25,7 @@ from flashdex.system.allocator import keep_freed_memory
 from flashdex.system.run_files import new_run
 from flashdex.training.build import RunBuilder
 from flashdex.training.run_dir import make_trainer
-from flashdex.training.tracking import TrackingTask
+from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 WARM_UPDATES = 8  # an even number, so that the actor stepped too

@@ -228,6 +228,8 @@ def grid_fault(body: Mapping[str, np.ndarray], mesh: Mesh, seed: int) -> str:
     """
     grid, spacing = body["sdf"], float(body["sdf_spacing"])
     low, high = body["aabb"].astype(np.float64)
+    if not np.isfinite([low, high]).all() or (low >= high).any():
+        return "its box is none"
     side = float((high - low).max())
     nodes, normals = (body["points"] - body["sdf_origin"]) / spacing, body["normals"]
     below, at, above = (

@@ -43,7 +43,6 @@ from flashdex.training.checkpoint import (
     set_aside_newer,
 )
 from flashdex.training.guard import GradientGuard, numeric_errors, read_dump
-from flashdex.training.gym import GymTask
 from flashdex.training.logging import MetricLog, check_writers
 from flashdex.training.session import (
     begin_session,
@@ -52,8 +51,9 @@ from flashdex.training.session import (
     refuse_changes,
     stored_value,
 )
-from flashdex.training.task import Task
-from flashdex.training.tracking import TrackingTask
+from flashdex.training.tasks.base import Task
+from flashdex.training.tasks.gym import GymTask
+from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)

@@ -34,7 +34,7 @@ from flashdex.training.guard import (
 from flashdex.training.logging import MetricLog
 from flashdex.training.session import SIGNAL, SessionStart, StopSignals
 from flashdex.training.stats import RunningStats
-from flashdex.training.task import Task
+from flashdex.training.tasks.base import Task
 
 _LOG = logging.getLogger(__name__)
 PLAIN_LOG_S = 30.0  # s between progress lines where there is no terminal

@@ -13,6 +13,8 @@ import yaml
 import flashdex
 from flashdex.cli.doctor import Finding, examine
 from flashdex.cli.main import main
+from flashdex.system.jsonl import write_object
+from flashdex.system.run_files import VERSIONS, write_recipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -129,7 +131,8 @@ def test_overrides_may_stand_behind_flags(run):
 
 def test_cfg_at_a_resume_prints_the_stored_recipe_and_starts_nothing(run, tmp_path):
     path = tmp_path / "recipe.yaml"
-    path.write_text(run("train", "quickstart", "seed=5", "--cfg", "job")[1])
+    write_object({"run": "0" * 32}, tmp_path, VERSIONS)
+    write_recipe(tmp_path, run("train", "quickstart", "seed=5", "--cfg", "job")[1])
     argv = ("train", "--resume", str(tmp_path), "algo.lr=2e-3", "--cfg", "job")
     code, out, _ = run(*argv)
     assert code == 0
@@ -137,7 +140,7 @@ def test_cfg_at_a_resume_prints_the_stored_recipe_and_starts_nothing(run, tmp_pa
     assert expected["algo"]["lr"] != 2e-3
     expected["algo"]["lr"] = 2e-3
     assert yaml.safe_load(out) == expected
-    assert list(tmp_path.iterdir()) == [path]
+    assert {*tmp_path.iterdir()} == {path, tmp_path / VERSIONS}
 
 
 def test_cp_then_validate(run, tmp_path):

@@ -34,10 +34,11 @@ def move(name, values):
     return turned + SHIFT if name.endswith(("pos", "center")) else turned
 
 
+LENGTHS = ("tip_dist", "joint_pos", "joint_vel", "joint_target")  # and angles
+
+
 def moved(td):
-    kept = {
-        n: v for n, v in td.items() if n not in ("tip_dist", "joint_pos", "joint_vel")
-    }
+    kept = {n: v for n, v in td.items() if n not in LENGTHS}
     return TensorDict({n: move(n, v) for n, v in kept.items()}, td.batch_size)
 
 

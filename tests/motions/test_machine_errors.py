@@ -110,7 +110,7 @@ def test_what_nobody_foresaw_is_not_kept(tmp_path, write_keypoints, monkeypatch)
     monkeypatch.setattr("flashdex.motions.pipeline.motion.settle_objects", fail)
     job = Job(listed, MotionSettings(attempts=1, cache_dir=tmp_path / "cache"))
     reasons = [run_job(job).rows[0]["reason"].split(":")[0] for _ in range(2)]
-    assert reasons == ["E_READ", "AGAIN"]
+    assert reasons == ["E_MACHINE", "AGAIN"]
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,9 @@ def test_score_refuses_what_replay_would_refuse(call, spoilt_run):
 
 def test_score_json_agrees_with_the_library(call, run_dir, rollout):
     path = run_dir / "rollouts" / "push.npz"
-    code, out, _ = call("score", path, "--json")
-    assert code == 0
+    code, out, err = call("score", path, "--json")
+    assert code == 1  # a rollout that does not say where it comes from
+    assert "provenance" in err
     found = json.loads(out)[str(path)]
     loaded = Rollout.load(path)
     expected = score(loaded.tracking_errors(), grace=loaded.grace)
@@ -106,7 +107,7 @@ def test_score_json_agrees_with_the_library(call, run_dir, rollout):
 def test_score_prints_a_table_a_file(call, run_dir):
     path = run_dir / "rollouts" / "push.npz"
     code, out, _ = call("score", path, path.with_name("./push.npz"))
-    assert code == 0
+    assert code == 1
     assert out.startswith(str(path))
     assert "object 5.0/30 mm" in out
 

@@ -19,7 +19,7 @@ from flashdex.rollouts.recorder import EpisodeRecorder
 from flashdex.rollouts.scorer import InlineScorer, ProcessScorer, ScorerSpec
 from flashdex.system.jsonl import read_lines
 from flashdex.system.machine import versions
-from flashdex.training.tracking import make_inline_scorer
+from flashdex.training.tasks.tracking import make_inline_scorer
 
 
 def die(spec):

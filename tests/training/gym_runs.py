@@ -6,8 +6,8 @@ from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import GymConfig
 from flashdex.recipe import GymRecipe, LoopConfig
 from flashdex.system.jsonl import read_lines, write_object
-from flashdex.training.gym import GymTask
 from flashdex.training.run_dir import make_trainer
+from flashdex.training.tasks.gym import GymTask
 
 TINY = {
     "batch_size": 16,

@@ -19,7 +19,7 @@ from flashdex.rollouts.scorer import InlineScorer
 from flashdex.training.guard import GradientGuard
 from flashdex.training.logging import MetricLog
 from flashdex.training.session import SessionStart
-from flashdex.training.tracking import TrackingTask
+from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Trainer
 
 

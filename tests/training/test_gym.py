@@ -18,8 +18,8 @@ from flashdex.cli.main import main
 from flashdex.envs.config import GymConfig
 from flashdex.envs.gym import GymEnv
 from flashdex.recipe import GymRecipe, compose
-from flashdex.training.gym import evaluate_policy
 from flashdex.training.run_dir import train
+from flashdex.training.tasks.gym import evaluate_policy
 
 # The published curves are those of the -v4 environments.
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")

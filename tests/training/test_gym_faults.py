@@ -26,9 +26,9 @@ from flashdex.system.tensors import write_tensors
 from flashdex.training import checkpoint
 from flashdex.training.checkpoint import newest_checkpoint
 from flashdex.training.guard import GradientGuard, NonFiniteError
-from flashdex.training.gym import SEED_OFFSET
 from flashdex.training.run_dir import evaluate, reopen, resume, train
 from flashdex.training.session import ended_by
+from flashdex.training.tasks.gym import SEED_OFFSET
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 

@@ -11,10 +11,10 @@ from flashdex.recipe import LoggerConfig, MotionsConfig, SearchRecipe, validate
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.search.config import Rung, SearchConfig
 from flashdex.system.run_files import read_metrics, read_sessions
-from flashdex.training import search as searching
 from flashdex.training.loaded import verify
 from flashdex.training.run_dir import train
-from flashdex.training.search import resume_search, search
+from flashdex.training.tasks import search as searching
+from flashdex.training.tasks.search import resume_search, search
 
 CHEAP = Rung(samples=6, rounds=1, horizon=12)
 LADDERS = SearchConfig(workers=1, ladder=[CHEAP], robust_ladder=[CHEAP])

@@ -37,7 +37,7 @@ from flashdex.training.evaluator import evaluate_motions
 from flashdex.training.memory.plan import check_memory
 from flashdex.training.memory.stand_in import find_library
 from flashdex.training.session import SessionStart
-from flashdex.training.task import Task
+from flashdex.training.tasks.base import Task
 
 if TYPE_CHECKING:
     from flashdex.training.trainer import Trainer

@@ -21,7 +21,7 @@ from flashdex.envs.gym import GymEnv
 from flashdex.errors import FlashdexError
 from flashdex.recipe import GymRecipe, RunRecipe, expect_kind
 from flashdex.training.session import SIGNAL, SessionStart
-from flashdex.training.task import Task
+from flashdex.training.tasks.base import Task
 
 if TYPE_CHECKING:
     from flashdex.training.trainer import Trainer

@@ -52,7 +52,7 @@ from flashdex.training.session import (
     end_session,
     interruptible,
 )
-from flashdex.training.tracking import TrackingTask
+from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Progress
 
 _LOG = logging.getLogger(__name__)

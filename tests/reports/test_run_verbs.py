@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from flashdex.cli.main import _show_run
+from flashdex.cli.runs import _show_run
 from flashdex.metrics.criteria import score
 from flashdex.rollouts.rollout import Rollout
 

@@ -9,14 +9,14 @@ import argparse
 import json
 from pathlib import Path
 
-from flashdex.system.jsonl import read_lines
+from flashdex.system.jsonl import read_lines, read_object
 from flashdex.system.machine import describe_commit, describe_hardware
 
 
 def summarise(run_dir: Path) -> dict[str, object]:
     """Counters at the end and the first pass of every motion of ``run_dir``."""
     last = read_lines(run_dir / "metrics.jsonl")[-1]
-    baselines = json.loads((run_dir / "baselines.json").read_text(encoding="utf-8"))
+    baselines = read_object(run_dir, "baselines.json")
     conversions: dict[str, object] = {}
     for line in read_lines(run_dir / "conversions.jsonl"):
         if line["converted"] and line["motion"] not in conversions:

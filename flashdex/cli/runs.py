@@ -40,7 +40,7 @@ def add_run_verbs(
         "search", _search, "search for the actions of each motion, without a policy"
     )
     verb.add_argument("recipe", nargs="?", help="name or path")
-    verb.add_argument("overrides", nargs="*", metavar="key=value")
+    add_overrides(verb)
     verb.add_argument("--resume", type=path, metavar="RUN", help="continue a search")
     verb.add_argument(
         "--workers", metavar="N", help="processes, the same as search.workers=N"

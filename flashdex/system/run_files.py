@@ -144,6 +144,21 @@ def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
         yield hold
 
 
+@contextmanager
+def resumed_run(run_dir: Path) -> Iterator[RunHold]:
+    """Hold a run to go on with: its files are whole, what a crash left is removed.
+
+    Raises:
+        RunError: another process is at it, or a file is not as the run left it.
+    """
+    with hold_run(run_dir) as hold:
+        check_run(run_dir)
+        check_sessions(run_dir)
+        with reported(run_dir):
+            remove_temporaries(run_dir)
+        yield hold
+
+
 def write_recipe(run_dir: Path, recipe: str) -> None:
     """Store the recipe of a run, YAML, with its seal."""
     with open_own(run_dir, RECIPE) as file:

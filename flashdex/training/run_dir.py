@@ -26,12 +26,11 @@ from flashdex.system.run_files import (
     RECIPE,
     check_run,
     check_sessions,
-    hold_run,
     new_run,
     read_recipe,
     refuse_old_run,
-    remove_temporaries,
     reported,
+    resumed_run,
     run_id,
     write_recipe,
 )
@@ -109,11 +108,7 @@ def resume(run: str | Path, overrides: list[str] | None = None) -> Path:
     run_dir, overrides = Path(run), overrides or []
     recipe = load_run_recipe(run_dir, overrides)
     check_writers(recipe)
-    with hold_run(run_dir) as hold:
-        check_run(run_dir)
-        check_sessions(run_dir)
-        with reported(run_dir):
-            remove_temporaries(run_dir)
+    with resumed_run(run_dir) as hold:
         state = None
         if has_checkpoint(run_dir):
             state = _load_state(run_dir, task_of(recipe).resumed_keys)

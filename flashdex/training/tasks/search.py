@@ -22,6 +22,7 @@ from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
 from flashdex.errors import FlashdexError, RunError
 from flashdex.metrics.tally import is_unmoved
 from flashdex.recipe import SearchRecipe, dump_recipe, expect_kind
+from flashdex.rollouts.build import grace_steps
 from flashdex.rollouts.certificate import Certificate, certify
 from flashdex.rollouts.ledger import Ledger, read_ledger
 from flashdex.rollouts.recorder import Episode
@@ -34,13 +35,10 @@ from flashdex.search.problem import Problem
 from flashdex.system.children import spawning_pool
 from flashdex.system.files import RunHold
 from flashdex.system.run_files import (
-    check_run,
-    check_sessions,
-    hold_run,
     new_run,
     refuse_old_run,
-    remove_temporaries,
     reported,
+    resumed_run,
 )
 from flashdex.training.build import RunBuilder
 from flashdex.training.logging import MetricLog, check_writers
@@ -90,11 +88,7 @@ def resume_search(run: str | Path) -> Path:
     run_dir = Path(run)
     recipe = expect_kind(load_run_recipe(run_dir), SearchRecipe, where=str(run_dir))
     check_writers(recipe)
-    with hold_run(run_dir) as hold:
-        check_run(run_dir)
-        check_sessions(run_dir)
-        with reported(run_dir):
-            remove_temporaries(run_dir)
+    with resumed_run(run_dir) as hold:
         with interruptible():
             task = TrackingTask(RunBuilder.from_recipe(recipe))
         task.check_inputs(run_dir)
@@ -329,13 +323,12 @@ class _Worker:
         problem = self.problem(order.row)
         before = problem.simulated
         rungs: list[Rung] = [*search.ladder, *search.robust_ladder]
-        grace = round(0.25 * self.builder.bank.fps)
         plan = Planner(
             problem,
             search,
             rungs[order.rung],
             limits=self.limits,
-            grace=grace,
+            grace=grace_steps(self.builder.bank.fps),
             seed=[self.recipe.seed, order.row, order.rung],
         ).run()
         episode = Episode(

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
+# of a motion's first pass, what a better proof of a later one replaces
+NEWEST = ("certified", "verdict", "survived")
 
 Line = dict[str, Any]
 
@@ -52,7 +54,7 @@ class Tally:
             if line["converted"]:
                 self.conversions[name] = dict(line)
         elif line.get("verdict") is not None and not self.moves_more(before, line):
-            newest = {key: line.get(key) for key in ("certified", "verdict")}
+            newest = {key: line.get(key) for key in NEWEST}
             before.update(newest)
         return self.is_done(name) and not was_done
 

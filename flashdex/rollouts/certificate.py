@@ -65,6 +65,11 @@ class Certificate:
     safety: dict[str, Any]  # penetration mm, force N, joint limits, warnings, NaN
     provenance: dict[str, Any]  # seed, env steps, hashes, hardware
 
+    @property
+    def survived(self) -> float:
+        """Share of the perturbed replays that pass by the rollout's criterion."""
+        return self.perturbed["pass_fraction"].get(self.identity["criterion"]) or 0.0
+
     def counted(self, rollout: Rollout) -> Certificate:
         """The proof of the same rollout, whose env steps are known only now."""
         identity = {**self.identity, "rollout_sha256": rollout.content_sha256}

@@ -40,7 +40,11 @@ LINE: dict[str, type | tuple[type, ...]] = {
     "errors": dict,
 }
 # and those that store a rollout, besides
-STORED = ("rollout", "verdict", "rollout_sha256", "certificate_sha256")
+STORED = {
+    **dict.fromkeys(("rollout", "verdict"), (str, type(None))),
+    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), (str, type(None))),
+    "survived": (float, type(None)),  # share of perturbed replays
+}
 # of a search: of its ladder; core-seconds of the attempt, and of the run so far
 SEARCHED = {"rung": int, "attempt_s": float, "core_s": float}
 
@@ -54,7 +58,7 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
     lines = read_lines(path, LINE)
     for number, line in enumerate(lines, start=1):
         check_name(line["motion"], what="motion", where=f"{path}: line {number}")
-        more = {key: (str, type(None)) for key in STORED if key in line}
+        more = {key: kind for key, kind in STORED.items() if key in line}
         searched = SEARCHED if line["source"] == "search" else {}
         check_keys(line, {**more, **searched}, path, number)
         errors = line["errors"]  # of a state that diverged they are not finite
@@ -118,8 +122,8 @@ class Ledger(Tally):
             wall_s: seconds of the run so far.
             is_own: it was made here; a model that was found in a file is tried in a
                 child process first.
-            certificate: of the rollout, where it has been made already; one that is
-                robust may replace what is only certified.
+            certificate: of the rollout, where it has been made already; where more
+                perturbed replays pass, it replaces the one before.
             more: entries of the line that its source adds.
 
         Returns:
@@ -185,6 +189,7 @@ class Ledger(Tally):
             "certificate_sha256": hash_content(proof),
             "certified": verdict in PROVEN,
             "verdict": verdict,
+            "survived": certificate.survived,
         }
 
     def adopt(self, *, wall_s: float) -> list[str]:
@@ -253,9 +258,12 @@ def _prove(rollout: Rollout, *, is_own: bool) -> Certificate | None:
 
 
 def _is_better(certificate: Certificate | None, before: dict[str, Any]) -> bool:
-    """A proof of robustness, against a line whose rollout has none."""
-    is_robust = certificate is not None and certificate.verdict == "robust"
-    return is_robust and before.get("verdict") != "robust"
+    """A proof in which more perturbed replays pass than by a line."""
+    return (
+        certificate is not None
+        and certificate.verdict in PROVEN
+        and certificate.survived > (before.get("survived") or 0.0)
+    )
 
 
 SPEED = "convert/per_hour"  # of a clock that went on between two readings

@@ -18,7 +18,7 @@ from flashdex.recipe import Recipe
 from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.claims import Era, RunClaims
-from flashdex.rollouts.findings import Finding, differences, faults
+from flashdex.rollouts.findings import Finding, at, differences, faults
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
     ROLLOUTS,
@@ -263,6 +263,7 @@ class _RunCheck:
             ("engine", line["engine"], json.loads(rollout.versions).get("engine")),
             ("criterion", line["criterion"], rollout.criterion),
             ("verdict", line.get("verdict"), verdict),
+            ("survived", line.get("survived"), _survived(stored)),
             ("certified", line["certified"], verdict in PROVEN if verdict else None),
             *(
                 (
@@ -278,6 +279,12 @@ class _RunCheck:
             for key, said, right in pairs
             for text in differences(said, right, at=key, tolerance=2e-6)
         ]
+
+
+def _survived(certificate: dict[str, Any]) -> float | None:
+    """Share of perturbed replays that pass, as a stored certificate says."""
+    criterion = at(certificate, "identity", "criterion")
+    return at(certificate, "perturbed", "pass_fraction", criterion)
 
 
 def _without_end(passed: list[Any]) -> list[Any]:

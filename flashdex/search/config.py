@@ -20,8 +20,12 @@ class Rung:
     """Control steps looked ahead."""
     worlds: int = number(1, low=1, high=64)
     """Worlds each sequence is tried in: the nominal one, and perturbed ones."""
+    retries: int = number(0, low=0, high=1000)
+    """Times that a pass goes back where it has lost an object."""
     spread: float = number(1.0, above=0, high=100)
     """Factor of all noise."""
+    tries: int = number(1, low=1, high=10_000)
+    """Passes by it, each with noise of its own, before the next rung."""
 
 
 def _ladder() -> list[Rung]:
@@ -70,6 +74,10 @@ class SearchConfig:
     """Factor of the noise from round to round."""
     elite: int = number(6, low=1, high=10_000)
     """Best samples that the next round is drawn around."""
+    enough: float = number(0.25, low=0, high=1000)
+    """Mean error, in limits of the criterion, at which a window is not drawn anew."""
+    lost: float = number(2.0, above=0, high=1000)
+    """Mean error of a stride, in limits, at which the object counts as lost."""
     stride: int = number(8, low=1, high=10_000)
     """Control steps that are decided before looking ahead again."""
     knot: int = number(4, low=1, high=1000)
@@ -83,7 +91,9 @@ class SearchConfig:
     end_weight: float = number(1.0, low=0, high=1000)
     """Weight added to the last quarter of the horizon."""
     budget_s: float = number(60.0, above=0, high=1e7)
-    """Core-seconds of a motion; a rung that has begun is finished."""
+    """Core-seconds of a motion until a plan passes; a pass that has begun is finished."""
+    robust_budget_s: float = number(90.0, low=0, high=1e7)
+    """Core-seconds from there on, until a plan survives perturbations."""
     workers: int = number(0, low=0, high=1024)
     """Processes, one motion each at a time; 0 = one a core."""
     ladder: list[Rung] = dataclasses.field(default_factory=_ladder)

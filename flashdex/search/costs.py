@@ -61,6 +61,14 @@ def shares(trial: Trial, problem: Problem, first: int, limits: ErrorLimits) -> S
     )
 
 
+@dataclass(frozen=True)
+class Costs:
+    """Of N sequences."""
+
+    total: Array  # (N,)
+    error: Array  # mean share of the limits, of the object that is worse, (N,)
+
+
 def cost(
     trial: Trial,
     knots: Array,
@@ -69,8 +77,8 @@ def cost(
     config: SearchConfig,
     first: int,
     limits: ErrorLimits,
-) -> Array:
-    """Cost of N sequences, mean over the worlds, (N,).
+) -> Costs:
+    """Cost of N sequences, mean over the worlds.
 
     Objects count as shares of their limits, the end of the horizon more; fingertips
     that should touch by their distance from where they belong; then size and
@@ -102,4 +110,4 @@ def cost(
     if knots.shape[1] > 1:
         jumps = np.diff(knots, axis=1) / np.maximum(noise, 1e-9)
         out += config.smooth_weight * (jumps**2).mean((-1, -2, -3))
-    return out
+    return Costs(out, found.worst.mean((-1, -2)))

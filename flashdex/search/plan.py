@@ -16,6 +16,7 @@ from flashdex.search.costs import ErrorLimits, cost, shares
 from flashdex.search.problem import Problem, Worlds
 
 Array = NDArray[np.float64]
+BACK = 2  # strides gone back at least where an object is lost, and one more each time
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,21 @@ class Plan:
 
     actions: NDArray[np.float32]  # (S', 2, J); S' < S where it was given up
     is_whole: bool
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """How far a pass has come, to go back to."""
+
+    worlds: Worlds
+    total: Array  # errors of position and rotation so far, in limits, (2, O)
+    done: list[NDArray[np.float32]]  # strides of actions
+    knots: Array
+
+    @property
+    def step(self) -> int:
+        """The control step that comes next."""
+        return sum(len(actions) for actions in self.done)
 
 
 def closing_directions(hand: HandSpec) -> Array:
@@ -70,6 +86,7 @@ class Planner:
     ) -> None:
         self.problem, self.config, self.rung = problem, config, rung
         self.limits, self.grace = limits, grace
+        self._effort = 1.0  # factor of samples, and of the noise squared
         self._rng = np.random.default_rng(seed)
         count = problem.steps // config.knot + 2
         steps = np.arange(problem.steps) / config.knot
@@ -110,37 +127,60 @@ class Planner:
         best = middle = self._knots[used]
         lowest = np.inf
         for turn in range(rung.rounds):
-            noise = self._draw(rung.samples, len(used)) * config.anneal**turn
+            noise = self._draw(round(rung.samples * self._effort), len(used))
+            noise *= config.anneal**turn * self._effort**0.5
             tried = middle + noise
             tried[0], tried[1] = middle, best
             tried = tried.clip(-1, 1)
             actions = problem.spread(np.einsum("hq,nqaj->nhaj", basis, tried))
             trial = problem.simulate(worlds, actions, first)
             costs = cost(trial, tried, self._noise, problem, config, first, self.limits)
-            order = np.argsort(costs, kind="stable")
+            order = np.argsort(costs.total, kind="stable")
             middle = tried[order[: config.elite]].mean(0)
-            if costs[order[0]] < lowest:
-                best, lowest = tried[order[0]], costs[order[0]]
+            if costs.total[order[0]] < lowest:
+                best, lowest = tried[order[0]], costs.total[order[0]]
+            if costs.error[order[0]] < config.enough:
+                break
         self._knots[used] = best
         return problem.spread(np.einsum("hq,qaj->haj", basis, best))
 
     def run(self) -> Plan:
-        """One pass; it is given up once the errors so far are beyond the limits."""
-        problem, stride = self.problem, self.config.stride
-        worlds, first = problem.worlds(self.rung.worlds), 0
-        total = np.zeros((2, len(problem.slots)))
-        done: list[NDArray[np.float32]] = []
-        while first < problem.steps:
-            stop = min(problem.steps, first + self.rung.horizon)
-            actions = self._window(worlds, first, stop)[:stride]
-            trial = problem.simulate(worlds, actions[None], first)
-            done.append(actions)
-            found = shares(trial, problem, first, self.limits)
-            scored = slice(max(0, self.grace - first), None)
-            for i, errors in enumerate((found.pos, found.rot)):
-                total[i] += errors[0, 0, scored].sum(0)
-            worlds = worlds.after(trial.states[0, :, -1])
-            first += len(actions)
-            if total.max() > problem.steps - self.grace:
+        """One pass; it is given up once the errors so far are beyond the limits.
+
+        Where an object is lost, the pass goes back some strides and tries harder there,
+        as often as the rung allows.
+        """
+        problem, rung = self.problem, self.rung
+        at = _Mark(problem.worlds(rung.worlds), np.zeros((2, len(problem.slots))), [], self._knots.copy())
+        marks, retries, until = [at], 0, 0
+        while at.step < problem.steps:
+            self._effort = 2.0 if at.step < until else 1.0
+            at, error = self._advance(at)
+            is_over = at.total.max() > problem.steps - self.grace
+            if (is_over or error > self.config.lost) and retries < rung.retries:
+                retries += 1
+                until = max(until, at.step)
+                back = BACK + retries
+                marks = marks[: max(1, len(marks) - back)]
+                at = marks[-1]
+                self._knots[:] = at.knots
+                continue
+            if is_over:
                 break
-        return Plan(np.concatenate(done), first >= problem.steps)
+            marks.append(at)
+        return Plan(np.concatenate(at.done), at.step >= problem.steps)
+
+    def _advance(self, at: _Mark) -> tuple[_Mark, float]:
+        """Decide the next stride and play it; the mean error in it, in limits."""
+        problem, first = self.problem, at.step
+        stop = min(problem.steps, first + self.rung.horizon)
+        actions = self._window(at.worlds, first, stop)[: self.config.stride]
+        trial = problem.simulate(at.worlds, actions[None], first)
+        found = shares(trial, problem, first, self.limits)
+        scored = slice(max(0, self.grace - first), None)
+        total = at.total + np.stack(
+            [errors[0, 0, scored].sum(0) for errors in (found.pos, found.rot)]
+        )
+        worlds = at.worlds.after(trial.states[0, :, -1])
+        error = float(found.worst.mean())
+        return _Mark(worlds, total, [*at.done, actions], self._knots.copy()), error

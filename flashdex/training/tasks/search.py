@@ -115,12 +115,18 @@ def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
     return run_dir
 
 
+def every_pass(ladder: list[Rung]) -> list[Rung]:
+    """The rung of each pass, one after the other."""
+    return [rung for rung in ladder for _ in range(rung.tries)]
+
+
 @dataclass
 class _Progress:
     """What has been tried of one motion."""
 
     rung: int = -1  # the last one that was tried
     core_s: float = 0.0
+    robust_s: float = 0.0  # of these, by the robust ladder
     miss: float = float("inf")  # least worst error of a whole plan, in limits
 
 
@@ -129,7 +135,7 @@ class _Order:
     """What a worker is asked for."""
 
     row: int
-    rung: int  # in the ladder, and the robust one behind it
+    rung: int  # place among the passes of the ladder, then of the robust one
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,8 @@ class _Session:
     def __post_init__(self) -> None:
         self.recipe = expect_kind(self.task.recipe, SearchRecipe, where="search")
         self.search: SearchConfig = self.recipe.search
-        self.rungs = [*self.search.ladder, *self.search.robust_ladder]
+        self.first_robust = len(every_pass(self.search.ladder))
+        self.num_passes = self.first_robust + len(every_pass(self.search.robust_ladder))
         self.limits = ErrorLimits.of(self.recipe.train.criterion)
         self.names = self.task.builder.bank.names
         self.motions = {name: _Progress() for name in self.names}
@@ -173,8 +180,11 @@ class _Session:
         """Count an attempt: what it cost, and how near it came."""
         one = self.motions[line["motion"]]
         one.rung = max(one.rung, line.get("rung", -1))
-        one.core_s += line.get("attempt_s", 0.0)
-        self.core_s += line.get("attempt_s", 0.0)
+        spent = line.get("attempt_s", 0.0)
+        one.core_s += spent
+        self.core_s += spent
+        if line.get("rung", -1) >= self.first_robust:
+            one.robust_s += spent
         self.env_steps = max(self.env_steps, line["env_steps"])
         if line["completed"] and not is_unmoved(line):
             errors = line["errors"]
@@ -187,15 +197,18 @@ class _Session:
         found = []
         for row, name in enumerate(self.names):
             one, before = self.motions[name], self.ledger.conversions.get(name)
-            if name in busy or one.core_s >= self.search.budget_s:
+            if name in busy:
                 continue
-            rung, last = one.rung + 1, len(self.search.ladder)
-            if before is not None and not is_unmoved(before):
-                if before.get("verdict") == "robust":
-                    continue
-                rung, last = max(rung, last), len(self.rungs)
-            if rung < last:
-                found.append((rung, one.miss, row))
+            if before is None or is_unmoved(before):
+                rung, last, near = one.rung + 1, self.first_robust, one.miss
+                spent = one.core_s >= self.search.budget_s
+            else:
+                rung, last = max(one.rung + 1, self.first_robust), self.num_passes
+                near = -(before.get("survived") or 0.0)
+                spent = one.robust_s >= self.search.robust_budget_s
+                spent = spent or before.get("verdict") == "robust"
+            if rung < last and not spent:
+                found.append((rung, near, row))
         rung, _, row = min(found, default=(0, 0.0, -1))
         return None if row < 0 else _Order(row, rung)
 
@@ -322,7 +335,7 @@ class _Worker:
         begun, search = time.process_time(), self.recipe.search
         problem = self.problem(order.row)
         before = problem.simulated
-        rungs: list[Rung] = [*search.ladder, *search.robust_ladder]
+        rungs = [*every_pass(search.ladder), *every_pass(search.robust_ladder)]
         plan = Planner(
             problem,
             search,

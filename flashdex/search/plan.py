@@ -16,7 +16,8 @@ from flashdex.search.costs import ErrorLimits, cost, shares
 from flashdex.search.problem import Problem, Worlds
 
 Array = NDArray[np.float64]
-BACK = 2  # strides gone back at least where an object is lost, and one more each time
+BACK = 2  # strides gone back at least, with what was lost in, where an object is lost
+EFFORT = 2.0  # factor of samples there, and of the noise squared
 
 
 @dataclass(frozen=True)
@@ -151,23 +152,28 @@ class Planner:
         as often as the rung allows.
         """
         problem, rung = self.problem, self.rung
-        at = _Mark(problem.worlds(rung.worlds), np.zeros((2, len(problem.slots))), [], self._knots.copy())
-        marks, retries, until = [at], 0, 0
+        at = _Mark(
+            problem.worlds(rung.worlds),
+            np.zeros((2, len(problem.slots))),
+            [],
+            self._knots.copy(),
+        )
+        marks, retries, depth, until = [at], rung.retries, 0, 0
         while at.step < problem.steps:
-            self._effort = 2.0 if at.step < until else 1.0
+            self._effort = EFFORT if at.step < until else 1.0
             at, error = self._advance(at)
             is_over = at.total.max() > problem.steps - self.grace
-            if (is_over or error > self.config.lost) and retries < rung.retries:
-                retries += 1
-                until = max(until, at.step)
-                back = BACK + retries
-                marks = marks[: max(1, len(marks) - back)]
+            if (is_over or error > self.config.lost) and retries:
+                # deeper each time that it gets no further
+                depth = depth + 1 if at.step <= until else 1
+                retries, until = retries - 1, max(until, at.step)
+                marks = marks[: max(1, len(marks) - BACK - depth)]
                 at = marks[-1]
-                self._knots[:] = at.knots
-                continue
-            if is_over:
+                self._knots = at.knots.copy()
+            elif is_over:
                 break
-            marks.append(at)
+            else:
+                marks.append(at)
         return Plan(np.concatenate(at.done), at.step >= problem.steps)
 
     def _advance(self, at: _Mark) -> tuple[_Mark, float]:

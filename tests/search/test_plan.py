@@ -44,6 +44,35 @@ def test_a_pass_beyond_its_limits_is_given_up(make_problem):
     assert len(found.actions) < problem.steps
 
 
+def test_a_pass_goes_back_where_it_loses_an_object(make_problem):
+    """Under limits by which the same noise gives up, tries more, and comes through."""
+    problem, strict = make_problem("right_box"), ErrorLimits(0.005, 0.1)
+    once = plan(problem, CHEAP, (3,), grace=0, limits=strict)
+    before = problem.simulated
+    again = dataclasses.replace(CHEAP, retries=6)
+    found = plan(problem, again, (3,), grace=0, limits=strict)
+    assert not once.is_whole
+    assert found.is_whole
+    assert problem.simulated - before > problem.steps * (CHEAP.samples + 1)
+
+    def error(actions):
+        trial = problem.simulate(problem.worlds(1), actions[None, : len(once.actions)])
+        return shares(trial, problem, 0, strict).worst.mean()
+
+    assert error(found.actions) < 0.8 * error(once.actions)
+
+
+def test_a_window_that_is_near_enough_is_not_drawn_anew(make_problem):
+    problem, rung = make_problem("right_box"), dataclasses.replace(CHEAP, rounds=4)
+    costs = []
+    for enough in (0.0, 1000.0):
+        before = problem.simulated
+        plan(problem, rung, enough=enough)
+        costs.append(problem.simulated - before)
+    strides = problem.steps  # played once besides
+    assert costs[1] - strides < 0.3 * (costs[0] - strides)
+
+
 def test_more_samples_come_closer(make_problem):
     """Against playback, by the errors of the whole motion in the untouched scene."""
     problem = make_problem("both")

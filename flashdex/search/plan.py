@@ -12,7 +12,7 @@ from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandSpec
 from flashdex.keys import SIDES
 from flashdex.search.config import Rung, SearchConfig
-from flashdex.search.costs import ErrorLimits, cost, shares
+from flashdex.search.costs import Costs, ErrorLimits, cost, shares
 from flashdex.search.problem import Problem, Worlds
 
 Array = NDArray[np.float64]
@@ -134,8 +134,7 @@ class Planner:
             tried[0], tried[1] = middle, best
             tried = tried.clip(-1, 1)
             actions = problem.spread(np.einsum("hq,nqaj->nhaj", basis, tried))
-            trial = problem.simulate(worlds, actions, first)
-            costs = cost(trial, tried, self._noise, problem, config, first, self.limits)
+            costs = self._costs(worlds, actions, tried, first)
             order = np.argsort(costs.total, kind="stable")
             middle = tried[order[: config.elite]].mean(0)
             if costs.total[order[0]] < lowest:
@@ -144,6 +143,29 @@ class Planner:
                 break
         self._knots[used] = best
         return problem.spread(np.einsum("hq,qaj->haj", basis, best))
+
+    def _costs(
+        self, worlds: Worlds, actions: NDArray[np.float32], knots: Array, first: int
+    ) -> Costs:
+        """Costs of N sequences; only those that do well nominally are perturbed."""
+
+        def found(worlds: Worlds, some: Array) -> Costs:
+            trial = self.problem.simulate(worlds, actions[some], first)
+            given = (knots[some], self._noise, self.problem, self.config)
+            return cost(trial, *given, first, self.limits)
+
+        nominal = found(worlds.only(slice(1)), np.arange(len(actions)))
+        rest = len(worlds.models) - 1
+        if not rest:
+            return nominal
+        most = max(self.config.elite, len(actions) // 4)
+        best = np.argsort(nominal.total, kind="stable")[:most]
+        perturbed = found(worlds.only(slice(1, None)), best)
+        out = Costs(np.full(len(actions), np.inf), np.full(len(actions), np.inf))
+        for name in ("total", "error"):
+            one, others = getattr(nominal, name)[best], getattr(perturbed, name)
+            getattr(out, name)[best] = (one + rest * others) / (1 + rest)
+        return out
 
     def run(self) -> Plan:
         """One pass; it is given up once the errors so far are beyond the limits.

@@ -22,8 +22,7 @@ from flashdex.envs.reference import ReferenceBank, stack_hands
 from flashdex.envs.scene.perturbation import (
     PERTURBATION,
     control_range,
-    perturb_model,
-    perturb_objects,
+    worst_case,
 )
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.spec import HandSpec
@@ -46,6 +45,10 @@ class Worlds:
     def after(self, states: Array) -> Worlds:
         """The same worlds in other states, (K, .)."""
         return Worlds(self.models, states, self.noise)
+
+    def only(self, which: slice) -> Worlds:
+        """Some of the worlds."""
+        return Worlds(self.models[which], self.states[which], self.noise[which])
 
 
 @dataclass(frozen=True)
@@ -192,8 +195,9 @@ class Problem:
         noise = np.zeros((count, self.steps, self.model.nu))
         for k in range(1, count):
             rng = np.random.default_rng([_DRAWS, k])
-            model = perturb_model(self.model, self._bodies, rng)
-            qpos = perturb_objects(self.qpos0, self.adr, rng)
+            model, qpos = worst_case(
+                self.model, self.qpos0, self._bodies, self.adr, k, seed=_DRAWS
+            )
             width = control_range(model, self.controls(self._still(), 0)[0])
             noise[k] = rng.normal(size=noise[k].shape) * PERTURBATION.ctrl_noise * width
             models.append(model)

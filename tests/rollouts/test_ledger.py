@@ -236,7 +236,9 @@ def test_an_object_that_hardly_moves_is_trivial_until_it_moves(
 def test_a_proof_without_movement_proves_no_movement(
     tmp_path, library, passing, monkeypatch
 ):
-    made = SimpleNamespace(save=lambda path: path.write_text("{}"), verdict="failed")
+    made = SimpleNamespace(
+        save=lambda path: path.write_text("{}"), verdict="failed", survived=0.0
+    )
     monkeypatch.setattr("flashdex.rollouts.ledger.certify", lambda *_, **__: made)
     still = copy.deepcopy(passing)
     still.object_pos[:] = still.object_pos[:1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -67,12 +67,57 @@ def perturb_objects(
         shift = rng.uniform(-sizes.object_pos, sizes.object_pos, size=3)
         axis = rng.normal(size=3)
         angle = rng.uniform(-sizes.object_rot, sizes.object_rot)
-        turn, quat = np.empty(4), np.empty(4)
-        mujoco.mju_axisAngle2Quat(turn, axis / np.linalg.norm(axis), angle)
-        mujoco.mju_mulQuat(quat, turn, qpos[adr + 3 : adr + 7])
-        qpos[adr : adr + 3] += shift
-        qpos[adr + 3 : adr + 7] = quat
+        _move(qpos, adr, shift, axis, angle)
     return qpos
+
+
+def worst_case(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    objects: np.ndarray,
+    addresses: np.ndarray,
+    index: int,
+    *,
+    seed: int,
+    sizes: Perturbation = PERTURBATION,
+) -> tuple[mujoco.MjModel, np.ndarray]:
+    """A corner of the disturbances: heavy, slippery, as far off as they go.
+
+    Even and odd ones are off in opposite directions.
+
+    Args:
+        model: stays as it is.
+        qpos: first positions, (nq,); stay as they are.
+        objects: body of each object.
+        addresses: of each object in qpos.
+        index: of the corner.
+        seed: of the directions.
+        sizes: of the disturbances.
+    """
+    heavy = replace(
+        sizes,
+        mass=(sizes.mass[1], sizes.mass[1]),
+        friction=(sizes.friction[0], sizes.friction[0]),
+    )
+    rng = np.random.default_rng([seed, index // 2])
+    model = perturb_model(model, objects, rng, heavy)
+    qpos = np.array(qpos, dtype=np.float64)
+    sign = 1 - 2 * (index % 2)
+    for adr in addresses:
+        shift = sign * sizes.object_pos * rng.choice([-1.0, 1.0], size=3)
+        _move(qpos, adr, shift, rng.normal(size=3), sign * sizes.object_rot)
+    return model, qpos
+
+
+def _move(
+    qpos: np.ndarray, adr: int, shift: np.ndarray, axis: np.ndarray, angle: float
+) -> None:
+    """Shift (m) and turn (rad, about a world axis) the object at ``adr``, in place."""
+    turn, quat = np.empty(4), np.empty(4)
+    mujoco.mju_axisAngle2Quat(turn, axis / np.linalg.norm(axis), angle)
+    mujoco.mju_mulQuat(quat, turn, qpos[adr + 3 : adr + 7])
+    qpos[adr : adr + 3] += shift
+    qpos[adr + 3 : adr + 7] = quat
 
 
 def control_range(

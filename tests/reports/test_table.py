@@ -30,7 +30,10 @@ def test_facts_of_a_run(run_dir, certificate):
     force = certificate.safety["force_peak"]
     assert certificate.nominal["sr_mt_obj_x0.5"]["state"] == "passed"
     worst = certificate.nominal["sr_mt_obj_frame"]["values"]["object_pos"]
-    assert f"mm: {depth:.1f} median, {depth:.1f} max; largest force, N: {force:.1f}" in text
+    assert (
+        f"mm: {depth:.1f} median, {depth:.1f} max; largest force, N: {force:.1f}"
+        in text
+    )
     assert row == {
         "motion": "push",
         "hand": "L",

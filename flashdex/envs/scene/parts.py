@@ -56,9 +56,7 @@ def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option.iterations = physics.iterations
     option.ls_iterations = physics.ls_iterations
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.solver = mujoco.mjtSolver.__members__[
-        f"mjSOL_{physics.solver.upper()}"
-    ]
+    option.solver = mujoco.mjtSolver.__members__[f"mjSOL_{physics.solver.upper()}"]
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = physics.impratio
     # A world that diverges is ended and counted; a silent reset would hide it.

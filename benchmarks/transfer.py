@@ -85,7 +85,8 @@ def change(sim: Simulation, setting: Mapping[str, Any]) -> Simulation:
         name = f"mjSOL_{setting['solver'].upper()}"
         model.opt.solver = mujoco.mjtSolver.__members__[name]
     if "gravcomp" in setting:
-        in_hand = np.unique(model.geom_bodyid[kinds == HAND])
+        driven = model.jnt_bodyid[model.actuator_trnid[:, 0]]
+        in_hand = np.isin(model.body_rootid, model.body_rootid[driven])
         model.body_gravcomp[in_hand] = setting["gravcomp"]
     step = setting.get("timestep", model.opt.timestep / setting.get("substeps", 1))
     substeps = round(rollout.decimation * model.opt.timestep / step)

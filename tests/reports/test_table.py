@@ -21,7 +21,7 @@ def row_of(text, name):
 def test_facts_of_a_run(run_dir, certificate):
     text = run_table(run_dir)
     assert (
-        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust, 1 strict), and 0 trivial, 7"
+        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust, 1 strict), and 0 trivial"
         in text
     )
     assert "16,000 env steps in 2 min 24 s" in text

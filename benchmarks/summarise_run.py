@@ -9,6 +9,7 @@ import argparse
 import json
 from pathlib import Path
 
+from flashdex.reports.run.facts import count, load_run, motion_facts, peaks, world_of
 from flashdex.system.jsonl import read_lines, read_object
 from flashdex.system.machine import describe_commit, describe_hardware
 
@@ -17,13 +18,20 @@ def summarise(run_dir: Path) -> dict[str, object]:
     """Counters at the end and the first pass of every motion of ``run_dir``."""
     last = read_lines(run_dir / "metrics.jsonl")[-1]
     baselines = read_object(run_dir, "baselines.json")
+    run = load_run(run_dir)
+    facts = motion_facts(run)
+    strict = {f.name: f.strict for f in facts}
     conversions: dict[str, object] = {}
     for line in read_lines(run_dir / "conversions.jsonl"):
         if line["converted"] and line["motion"] not in conversions:
             kept = ("env_steps", "wall_s", "core_s", "errors", "certified")
             kept += ("verdict", "trivial", "lift_ratio")
-            conversions[line["motion"]] = {key: line.get(key) for key in kept}
+            passed, worst = strict[line["motion"]]
+            found = {key: line.get(key) for key in kept}
+            found |= {"strict": passed, "worst_frame_m": worst}
+            conversions[line["motion"]] = found
     return {
+        "world": world_of(run.recipe),
         "env_steps": last["env_steps"],
         "minutes": round(60 * last["hours"], 2),
         "updates": last.get("updates"),
@@ -32,6 +40,8 @@ def summarise(run_dir: Path) -> dict[str, object]:
         "motions": len(baselines["frozen_object"]),
         "certified": last["convert/certified"],
         "robust": last["convert/robust"],
+        "strict": count(facts)["strict"],
+        "median_max": peaks(facts),
         "last_attempts_passing": last["convert/last"],
         "conversions": conversions,
         "baselines": {

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from synthetic import FRIENDLY
 
 from flashdex.algorithms.config import AlgoConfig
 from flashdex.envs.config import EnvConfig
@@ -40,7 +41,7 @@ def make_bench(library, hands, bank):
             Recipe(name="tiny", total_env_steps=6000),
             env=EnvConfig(num_envs=num_envs, **{"transforms": transforms, **env}),
             algo=AlgoConfig(**{**TINY, **(algo or {})}),
-            physics=PhysicsConfig(num_threads=1),
+            physics=PhysicsConfig(num_threads=1, **FRIENDLY),
             train=TrainConfig(**(train or {})),
         )
         return RunBuilder(recipe, library, hands, bank)
@@ -58,7 +59,7 @@ def roll_tiny(library, hands, bank):
         name="tiny",
         total_env_steps=1,
         env=EnvConfig(num_envs=3, finger_mode="residual"),
-        physics=PhysicsConfig(num_threads=1),
+        physics=PhysicsConfig(num_threads=1, **FRIENDLY),
     )
     bench = RunBuilder(recipe, library, hands, bank)
 
@@ -108,7 +109,7 @@ def start_tiny(library):
             Recipe(name="tiny", total_env_steps=360),
             run_dir=str(folder),
             motions=MotionsConfig(library=str(library.path), select=select),
-            physics=PhysicsConfig(num_threads=1),
+            physics=PhysicsConfig(num_threads=1, **FRIENDLY),
             env=EnvConfig(
                 num_envs=6,
                 attempt_share=0.5,

@@ -23,6 +23,9 @@ from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectAsset
 from flashdex.system.arrays import hash_content, write_array
 
+# `world=friendly`: in the default one, nothing of the synthetic library converts at once
+FRIENDLY = {"object_friction": 2.0, "support_friction": 1.0, "torsional_friction": 0.05}
+
 FPS = 60.0
 HALF = np.array([0.025, 0.03, 0.02])  # m, half extents of the box
 BALL = 0.03  # m, radius

@@ -18,6 +18,7 @@ _TITLES = {
     "hand": "hand=NAME",
     "motions": "motions=NAME",
     "physics": "physics=NAME, the engine",
+    "world": "world=NAME, its friction and what else flatters or not",
     "algo": "algo=NAME, the algorithm and its sizes",
     "logger": "logger=NAME",
     "ablation": "ablation=NAME, or several: 'ablation=[a,b]'",

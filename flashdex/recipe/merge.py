@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from flashdex.recipe.store import (
     recipe_files,
     search_dirs,
 )
-from flashdex.recipe.tasks import kind_of, mark_groups
+from flashdex.recipe.tasks import kind_of, mark_keys
 
 Options = dict[str, list[str] | None]
 """Options chosen for each group; None takes the group out."""
@@ -53,6 +53,7 @@ class _Composer:
         self.problems = problems
         self.chosen: Options = {}  # stronger than what a file says
         self.used: Options = {}
+        self.keys: set[str] = set()  # at the top of a recipe, that options write to
         self._open: list[Path] = []
         self._count = 0
 
@@ -103,13 +104,7 @@ class _Composer:
         if not isinstance(entries, list):
             self.problems.append(f"{where}: defaults: expected a list")
             entries = []
-        package = _PACKAGE.search(text)
-        if package is not None and package[1] != "_global_":
-            self.problems.append(
-                f"{where}: '@package {package[1]}' is not known; _global_ puts the "
-                "values at the top, without the line they belong to the group"
-            )
-        own = {group: body} if group and package is None else body
+        own = self._packaged(where, text, body, group) if group else body
         self._note_overrides(entries)
         merged: dict[str, Any] = {}
         for i, entry in enumerate(entries):
@@ -117,6 +112,21 @@ class _Composer:
             merged = merge(merged, own if entry == "_self_" else {})
             merged = merge(merged, self._entry(where, entry, before, group))
         return merged if "_self_" in entries else merge(merged, own)
+
+    def _packaged(
+        self, where: str, text: str, body: dict[str, Any], group: str
+    ) -> dict[str, Any]:
+        """The values of an option, under the key that it or its group is for."""
+        found = _PACKAGE.search(text)
+        package = found[1] if found else group
+        if package not in ("_global_", *self.groups):
+            self.problems.append(
+                f"{where}: '@package {package}' is not known; _global_ puts the "
+                "values at the top, the name of another group under that one's key, "
+                "without the line they belong to the group itself"
+            )
+        self.keys.add(group if package == "_global_" else package)
+        return body if package == "_global_" else {package: body}
 
     def _note_overrides(self, entries: list[Any]) -> None:
         """`override group: option` replaces what the files named before choose."""
@@ -237,7 +247,7 @@ def inspect_recipe(
     used = {group: options for group, options in composer.used.items() if options}
     if "ablation" in used:
         data["ablation"] = "+".join(used["ablation"] or ())
-    return _read(data, changes, problems, groups=list(used))
+    return _read(data, changes, problems, keys=composer.keys)
 
 
 def inspect_option(path: Path, group: str) -> list[str]:
@@ -254,14 +264,14 @@ def _read(
     data: dict[str, Any],
     changes: Sequence[Change],
     problems: list[str],
-    groups: Sequence[str] = (),
+    keys: Iterable[str] = (),
 ) -> tuple[RunRecipe, list[str]]:
     """Apply changes to composed values and check the whole."""
     data = merge(kind_of(data).make_base(), data)
     apply_changes(data, changes, problems)
     fill_in(data, problems)
     expand_home(data)
-    recipe, found = read_recipe(mark_groups(data, groups))
+    recipe, found = read_recipe(mark_keys(data, keys))
     return recipe, problems + found
 
 

@@ -22,7 +22,7 @@ from flashdex.search.config import SearchConfig
 
 def find_conflicts(recipe: Recipe) -> list[str]:
     """Return one line for each thing that does not fit together."""
-    checks = (_hand, _motions, _rate, _algo, _env, _expect)
+    checks = (_hand, _motions, _rate, _solver, _algo, _env, _expect)
     return [problem for check in checks for problem in check(recipe)]
 
 
@@ -57,6 +57,16 @@ def _rate(recipe: Recipe) -> list[str]:
         f"physics.timestep: {physics.decimation} substeps of {physics.timestep:.6g} s "
         f"make {step:.6g} s, but motions.control_hz={hz:g} asks for {1 / hz:.6g} s; "
         f"set physics.timestep={1 / hz / physics.decimation:.8g}"
+    ]
+
+
+def _solver(recipe: Recipe) -> list[str]:
+    physics = recipe.physics
+    if physics.solver != "pgs" or physics.engine == "cpu":
+        return []
+    return [
+        f"physics.solver: pgs is not available with physics.engine={physics.engine}; "
+        "use newton or cg, or physics=cpu"
     ]
 
 
@@ -236,7 +246,7 @@ class SearchRecipe(Recipe):
 
 def find_search_conflicts(recipe: SearchRecipe) -> list[str]:
     """Return one line for each thing that does not fit together."""
-    checks = (_hand, _motions, _rate, _ladders)
+    checks = (_hand, _motions, _rate, _solver, _ladders)
     return [problem for check in checks for problem in check(recipe)]
 
 
@@ -332,15 +342,15 @@ def split_foreign(
     return KINDS[task], kept
 
 
-def mark_groups(data: Mapping[str, Any], groups: Iterable[str]) -> dict[str, Any]:
-    """Add the groups that belong to another kind, or one without a value passes unseen.
+def mark_keys(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """Add the keys that belong to another kind, or one without a value passes unseen.
 
     Args:
         data: the composed recipe.
-        groups: those it chose an option of.
+        keys: those that the chosen options of groups write to.
     """
     own = kind_of(data).keys
-    return {**{group: None for group in groups if group not in own}, **data}
+    return {**{key: None for key in keys if key not in own}, **data}
 
 
 def expect_kind(recipe: RunRecipe, root: type[R], *, where: str) -> R:

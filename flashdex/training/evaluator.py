@@ -21,7 +21,8 @@ from flashdex.training.build import RunBuilder
 
 Controller = Callable[[TensorDictBase, TrackingEnv], Tensor]
 """State and environment to actions (N, 2, J)."""
-SHOWN = ("sr_mt_obj", "sr_mt_obj_moved", "sr_mt", "sr_spider_raw", "sr_spider_centred")
+SHOWN = ("sr_mt_obj", "sr_mt_obj_x0.5", "sr_mt_obj_moved", "sr_mt")
+SHOWN += ("sr_spider_raw", "sr_spider_centred")
 
 
 def roll_all(

@@ -28,6 +28,7 @@ from conformance_oracle import (
 from conformance_script import NUM_WORLDS, RIGHT, ROW, Script, make_script
 from engine_states import raw_state, reset_worlds
 from reduced import reduced_library
+from synthetic import FRIENDLY
 
 from flashdex.envs.physics.base import Physics
 from flashdex.envs.physics.config import PhysicsConfig
@@ -65,7 +66,7 @@ def script(small) -> Script:
 
 @pytest.fixture(scope="module")
 def scene(small, hands) -> Scene:
-    return build_scenes(small[0], hands, PhysicsConfig())[0]
+    return build_scenes(small[0], hands, PhysicsConfig(**FRIENDLY))[0]
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +93,7 @@ def play(small, script, hands) -> Callable[[Engine], Run]:
     def run_once(name: Engine) -> Run:
         for package in PACKAGES[name]:
             pytest.importorskip(package)
-        config = PhysicsConfig(engine=name, num_threads=1)
+        config = PhysicsConfig(engine=name, num_threads=1, **FRIENDLY)
         physics = build_engine(small[0], hands, config, NUM_WORLDS)
         record = run_engine(physics, script, STEPS_OF[name])
         raw = vars(physics.raw())

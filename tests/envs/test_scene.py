@@ -109,3 +109,23 @@ def test_layout_of_a_one_handed_collection_has_one_hand(library, hands):
     layout = SceneLayout.of(only)
     assert layout.sides == ("right",)
     assert (layout.num_objects, layout.num_parts, layout.num_supports) == (1, (1,), 1)
+
+
+def test_friction_and_solver_are_those_of_the_settings(library, hands):
+    from flashdex.envs.physics.config import PhysicsConfig
+    from flashdex.envs.scene.scene import build_scenes
+
+    physics = PhysicsConfig(friction=0.9, object_friction=0.4, support_friction=0.6)
+    model = build_scenes(library, hands, physics)[0].model
+    expected = {"right": 0.9, "left": 0.9, "object": 0.4, "support": 0.6}
+    for word, sliding in expected.items():
+        names = [n for i in range(model.ngeom) if (n := model.geom(i).name)]
+        rows = [model.geom(n) for n in names if n.startswith(word)]
+        solid = [g for g in rows if g.size[0] != 1e-3]  # grains fill unused places
+        assert solid
+        for geom in solid:
+            np.testing.assert_allclose(geom.friction, [sliding, 0.005, 1e-4])
+    solvers = {"newton": "NEWTON", "cg": "CG", "pgs": "PGS"}
+    for word, name in solvers.items():
+        model = build_scenes(library, hands, PhysicsConfig(solver=word))[0].model
+        assert mujoco.mjtSolver(model.opt.solver).name == f"mjSOL_{name}"

@@ -286,8 +286,10 @@ def default_of(path):
 )
 def test_no_recipe_repeats_a_default(file):
     text = file.read_text()
-    is_global = file.parent == RECIPES or "@package _global_" in text
-    prefix = () if is_global else (file.parent.name,)
+    package = re.search(r"@package (\S+)", text)
+    group = package[1] if package else file.parent.name
+    is_global = file.parent == RECIPES or group == "_global_"
+    prefix = () if is_global else (group,)
     for path, value in leaves(yaml.safe_load(text) or {}, prefix):
         if path in (("motions", "source"), ("total_env_steps",)):
             continue  # required: there is no default to repeat
@@ -329,3 +331,25 @@ def test_every_option_is_documented():
         assert term.about
         for field in dataclasses.fields(term.options):
             assert field.metadata["text"], f"{term.name}.{field.name}"
+
+
+def test_a_world_is_one_word_over_recipe_and_engine():
+    careful = compose("quickstart").physics
+    assert careful == compose("quickstart", ["world=careful"]).physics
+    friendly = compose("quickstart", ["world=friendly"]).physics
+    assert (friendly.object_friction, friendly.torsional_friction) == (2.0, 0.05)
+    assert careful.object_friction < careful.friction < friendly.object_friction
+    hard = compose("quickstart", ["world=hard", "physics.friction=0.6"]).physics
+    assert (hard.friction, hard.solver, hard.gravcomp) == (0.6, "cg", 0.0)
+    step = careful.timestep * careful.decimation
+    assert hard.timestep * hard.decimation == pytest.approx(step, rel=1e-9)
+    # what the recipe replicates is said in it, and a word still changes it
+    assert compose("bench50_xhand").physics.object_friction == 2.0
+    assert compose("bench50_xhand", ["world=careful"]).physics.object_friction == 0.5
+
+
+def test_what_has_no_world_or_solver_says_so():
+    with pytest.raises(RecipeError, match="physics: belongs to recipes with task"):
+        compose("gym_halfcheetah_small", ["world=careful"])
+    with pytest.raises(RecipeError, match="pgs is not available with"):
+        compose("quickstart", ["physics=warp", "physics.solver=pgs"])

@@ -21,22 +21,29 @@ def row_of(text, name):
 def test_facts_of_a_run(run_dir, certificate):
     text = run_table(run_dir)
     assert (
-        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust), and 0 trivial, 7"
+        "1 of 5 converted by sr_mt_obj, 1 certified (1 robust, 1 strict), and 0 trivial"
         in text
     )
     assert "16,000 env steps in 2 min 24 s" in text
     row = row_of(text, "push")
     depth = certificate.safety["penetration_max_mm"]
+    force = certificate.safety["force_peak"]
+    assert certificate.nominal["sr_mt_obj_x0.5"]["state"] == "passed"
+    worst = certificate.nominal["sr_mt_obj_frame"]["values"]["object_pos"]
+    assert (
+        f"mm: {depth:.1f} median, {depth:.1f} max; largest force, N: {force:.1f}"
+        in text
+    )
     assert row == {
         "motion": "push",
         "hand": "L",
         "tries": "2",
         "steps": "12.3k",
-        "min": "1.5",
         "mm": "5.0",
         "deg": "2.0",
         "lift": "-",
-        "path": "0.98",
+        "worst": f"{1e3 * worst:.0f}",
+        "half": "yes",
         "proof": "robust",
         "pert": f"{certificate.perturbed['pass_fraction']['sr_mt_obj']:.0%}",
         "pen": f"{depth:.1f}",

@@ -23,13 +23,17 @@ class PhysicsConfig:
     """Servo gains; vendor = what the real motors can follow (1.1 and 0.4 N m on
     XHand), paper = 20/1.5 with 100 N m, slower and far stronger."""
     gravcomp: float = number(1.0, low=0, high=1)
-    """Share of the hand's weight that is compensated; 0 is the released code."""
+    """Share of the hand's own weight that the arm compensates, as controllers do for a
+    tool that they were told of; never an object's. 0 is the released code."""
     friction: float = number(1.0, low=0, high=100)
-    """Sliding friction of hand geoms."""
-    object_friction: float = number(2.0, low=0, high=100)
+    """Sliding friction of hand geoms: rubber on plastic, wood, metal or glass."""
+    object_friction: float = number(0.5, low=0, high=100)
     """Sliding friction of object geoms; the larger of a pair counts."""
-    support_friction: float = number(1.0, low=0, high=100)
+    support_friction: float = number(0.5, low=0, high=100)
     """Sliding friction of supports; the larger of a pair counts."""
+    torsional_friction: float = number(0.005, low=0, high=1)
+    """Friction against spinning in place, of all geoms, m: torque over normal force,
+    about 0.6 x sliding friction x radius of the patch that touches."""
     condim: Literal[3, 4, 6] = 4
     """Contact dimensions of objects: 3 = sliding, 4 adds torsion at the fingertip, 6
     rolling."""
@@ -39,6 +43,8 @@ class PhysicsConfig:
     """Rebuild tables and shelves as discs; off, objects have no support at all."""
     hand_support_contact: bool = True
     """Hands touch supports; off, they pass through tables as in a mocap overlay."""
+    solver: Literal["newton", "cg", "pgs"] = "newton"
+    """Constraint solver; warp and brax have no pgs."""
     iterations: int = number(20, low=1, high=10_000)
     """Solver iterations; certificates use more."""
     ls_iterations: int = number(50, low=1, high=10_000)

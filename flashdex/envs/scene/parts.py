@@ -26,6 +26,7 @@ _GRAIN = 1e-3  # m, radius of a geom that fills an unused place
 # m; with its mass centre off the origin a body is never "simple", so that all scenes
 # have the same inertia structure
 INERTIA_OFFSET = 1e-5
+_ROLLING = 1e-4  # m, MuJoCo's own; with condim 6 only
 _SENSOR_DATA = 2 | 16  # bits of mjSENS_CONTACT: net force and position
 _NET_FORCE = 3  # reduction: one wrench at the force-weighted point, world axes
 
@@ -55,7 +56,7 @@ def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option.iterations = physics.iterations
     option.ls_iterations = physics.ls_iterations
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.solver = mujoco.mjtSolver.__members__[f"mjSOL_{physics.solver.upper()}"]
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = physics.impratio
     # A world that diverges is ended and counted; a silent reset would hide it.
@@ -63,12 +64,19 @@ def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     spec.compiler.degree = False
 
 
-def set_hand_friction(spec: mujoco.MjSpec, side: keys.Side, friction: float) -> None:
-    """Give all geoms of one hand its collision bits and sliding friction."""
+def set_hand_friction(
+    spec: mujoco.MjSpec, side: keys.Side, physics: PhysicsConfig
+) -> None:
+    """Give all geoms of one hand its collision bits and friction."""
     for geom in spec.geoms:
         if geom.parent.name.startswith(f"{side}_"):
             geom.contype, geom.conaffinity = HAND_BITS
-            geom.friction[0] = friction
+            geom.friction = _friction(physics.friction, physics)
+
+
+def _friction(sliding: float, physics: PhysicsConfig) -> list[float]:
+    """Sliding, torsional and rolling; of a pair each counts the larger."""
+    return [sliding, physics.torsional_friction, _ROLLING]
 
 
 def add_object(
@@ -106,7 +114,7 @@ def _add_part(
 ) -> None:
     geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh)
     geom.contype, geom.conaffinity = OBJECT_BITS
-    geom.friction = [physics.object_friction, 0.05, 0.05]
+    geom.friction = _friction(physics.object_friction, physics)
     geom.condim = physics.condim
     geom.rgba = [0.85, 0.55, 0.25, 1.0] if slot == 0 else [0.3, 0.6, 0.4, 1.0]
 
@@ -175,7 +183,7 @@ def add_supports(spec: mujoco.MjSpec, discs: Tensor, physics: PhysicsConfig) -> 
             rgba=[0.8, 0.8, 0.78, 1.0],
         )
         geom.contype, geom.conaffinity = bits
-        geom.friction = [physics.support_friction, 0.05, 0.05]
+        geom.friction = _friction(physics.support_friction, physics)
 
 
 def add_contact_sensors(

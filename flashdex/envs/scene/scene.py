@@ -171,7 +171,7 @@ def make_hands_spec(
     set_options(spec, physics)
     for side in sides:
         add_hand(spec, hands[side], gains=physics.gains, gravcomp=physics.gravcomp)
-        set_hand_friction(spec, side, physics.friction)
+        set_hand_friction(spec, side, physics)
     return spec
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from flashdex.errors import RecipeError, RunError, UnknownNameError
@@ -146,6 +147,7 @@ def _certificates(run_dir: Path) -> dict[str, Line]:
 
 
 PROVEN = ("certified", "robust")
+STRICT = "sr_mt_obj_x0.5"  # stands beside the criterion of the run in every table
 # quantity -> (heading, unit, factor from m or rad)
 SHOWN = {
     "object_pos": ("object", "mm", 1e3),
@@ -243,6 +245,18 @@ class MotionFacts:
         return shares.get(name), *peaks
 
     @property
+    def strict(self) -> tuple[bool | None, float | None]:
+        """Nominal replay: within half the limits? Largest object error of any frame, m.
+
+        None where it was not replayed, or by a version that did not say.
+        """
+        nominal = self.certificate.get("nominal", {})
+        state = nominal.get(STRICT, {}).get("state")
+        frame = nominal.get("sr_mt_obj_frame", {}).get("values", {})
+        passed = None if state in (None, "not_measured") else state == "passed"
+        return passed, frame.get("object_pos")
+
+    @property
     def failures(self) -> str:
         """Most frequent cause of failure with its share of the failed attempts.
 
@@ -310,9 +324,35 @@ def count(facts: list[MotionFacts]) -> dict[str, int]:
         "converted": len(converted),
         "certified": sum(f.verdict in PROVEN for f in converted),
         "robust": sum(f.verdict == "robust" for f in converted),
+        "strict": sum(f.strict[0] is True for f in converted),
         "trivial": len(passed) - len(converted),
         "attempts": sum(len(f.lines) for f in facts),
     }
+
+
+def world_of(recipe: Line) -> str:
+    """The settings that a conversion hangs on most, of a composed recipe.
+
+    Example:
+        >>> world_of({"physics": {"friction": 1.0, "object_friction": 0.5}})
+        'friction 1 hand, 0.5 object'
+    """
+    physics = recipe.get("physics", {})
+    parts = (("hand", "friction"), ("object", "object_friction"))
+    parts += (("support", "support_friction"), ("m spin", "torsional_friction"))
+    found = [f"{physics[key]:g} {name}" for name, key in parts if key in physics]
+    return f"friction {', '.join(found)}" if found else ""
+
+
+def peaks(facts: list[MotionFacts]) -> dict[str, tuple[float, float]]:
+    """Median and maximum over the replays of conversions: mm deep, and N."""
+    proofs = [f.proof for f in facts if f.is_converted]
+    found = {}
+    for place, name in ((1, "penetration_mm"), (2, "force_n")):
+        known = [proof[place] for proof in proofs if proof[place] is not None]
+        if known:
+            found[name] = (median(known), max(known))
+    return found
 
 
 def in_unit(quantity: str, value: Any) -> float | None:

@@ -12,6 +12,7 @@ from flashdex.reports.run.curves import conversion_charts, learning_charts
 from flashdex.reports.run.facts import (
     PROVEN,
     SHOWN,
+    STRICT,
     MotionFacts,
     RunData,
     count,
@@ -20,6 +21,8 @@ from flashdex.reports.run.facts import (
     load_run,
     motion_facts,
     num_motions,
+    peaks,
+    world_of,
 )
 from flashdex.reports.text import NOTHING, number
 from flashdex.system.files import own_file
@@ -57,6 +60,8 @@ def write_report(run_dir: str | Path) -> Path:
         run=run,
         hardware=_hardware(run),
         counts=count(rows),
+        peaks=peaks(rows),
+        world=world_of(run.recipe),
         promises=_promises(run),
         conversions=conversion_charts(run, rows, total=total),
         rows=[(row, _cells(run, row)) for row in rows],
@@ -116,6 +121,7 @@ def _shown_limits(criterion: str) -> dict[str, float | None]:
 def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
     """A row of the table of motions by heading, without the name."""
     first, (share, depth, force) = row.first, row.proof
+    is_strict, worst = row.strict
     limits = _shown_limits(run.criterion)
     errors = dict(_error(row, q, limit) for q, limit in limits.items())
     baselines = {
@@ -130,6 +136,8 @@ def _cells(run: RunData, row: MotionFacts) -> dict[str, Cell]:
         **errors,
         "lift ratio": (number(row.ratios[0], 2), ""),
         "path ratio": (number(row.ratios[1], 2), ""),
+        "worst frame mm": (number(in_unit("object_pos", worst)), ""),
+        STRICT: ({True: "passes", False: "fails", None: NOTHING}[is_strict], ""),
         "certificate": _verdict(row),
         "robust share": (NOTHING if share is None else f"{share:.0%}", ""),
         "penetration mm": (number(depth), ""),

@@ -11,6 +11,7 @@ from flashdex.metrics.criteria_table import Verdict
 from flashdex.recipe import task_of_run
 from flashdex.reports.run.facts import (
     SHOWN,
+    STRICT,
     MotionFacts,
     RunData,
     count,
@@ -19,12 +20,14 @@ from flashdex.reports.run.facts import (
     load_run,
     motion_facts,
     num_motions,
+    peaks,
+    world_of,
 )
 from flashdex.reports.run.report import write_report
 from flashdex.reports.text import MAX_WIDTH, align, duration, plain, short, shorten
 from flashdex.rollouts.findings import Finding
 
-NAME_WIDTH = 20
+NAME_WIDTH = 18
 BASELINES = {"do_nothing": "idle", "kinematic_playback": "playback"}
 RATIOS = ("lift", "path")
 STATES = {"passed": "yes", "failed": "no", "not_measured": "n.m."}
@@ -39,7 +42,8 @@ def run_table(run_dir: str | Path) -> str:
     lines = ["no motion has been attempted yet"]
     if found:
         lines = align([list(found[0]), *(list(cells.values()) for cells in found)])
-    out = [*_headline(run, rows), "", *lines, "", *_failures(rows), *_legend(run)]
+    out = [*_headline(run, rows), "", *lines, "", *_failures(rows)]
+    out += [*_peaks(rows), *_legend(run)]
     return "\n".join(line[:MAX_WIDTH].rstrip() for line in out)
 
 
@@ -49,10 +53,19 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
         f"engine {recipe.get('physics', {}).get('engine', '?')}  {_progress(run)}",
+        *filter(None, [world_of(recipe)]),
         f"{counts['converted']} of {num_motions(run, rows)} converted by "
-        f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust),"
-        f" and {counts['trivial']} trivial, {counts['attempts']:,} attempts",
+        f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust, "
+        f"{counts['strict']} strict), and {counts['trivial']} trivial, "
+        f"{counts['attempts']:,} attempts",
     ]
+
+
+def _peaks(rows: list[MotionFacts]) -> list[str]:
+    found = peaks(rows)
+    words = {"penetration_mm": "deepest contact, mm", "force_n": "largest force, N"}
+    parts = [f"{words[k]}: {a:.1f} median, {b:.1f} max" for k, (a, b) in found.items()]
+    return [f"replays: {'; '.join(parts)}"] if parts else []
 
 
 def _progress(run: RunData) -> str:
@@ -62,16 +75,18 @@ def _progress(run: RunData) -> str:
 
 def _cells(row: MotionFacts, baselines: list[str]) -> dict[str, str]:
     first, (share, depth, force) = row.first, row.proof
+    is_strict, worst = row.strict
     scores = {BASELINES.get(b, b)[:8]: row.baselines.get(b) for b in baselines}
     return {
         "motion": shorten(row.name + (" *" if row.trivial else ""), NAME_WIDTH),
         "hand": "+".join(side[0].upper() for side in row.hands) or "-",
         "tries": str(len(row.lines)),
         "steps": short(first["env_steps"]) if first else "-",
-        "min": plain(first["wall_s"] / 60) if first else "-",
         "mm": _error(row.errors, "object_pos"),
         "deg": _error(row.errors, "object_rot"),
-        **{name: plain(r, 2) for name, r in zip(RATIOS, row.ratios, strict=True)},
+        "lift": plain(row.ratios[0], 2),
+        "worst": plain(in_unit("object_pos", worst), 0),
+        "half": {True: "yes", False: "no", None: "-"}[is_strict],
         "proof": row.verdict or "-",
         "pert": "-" if share is None else f"{share:.0%}",
         "pen": plain(depth),
@@ -109,7 +124,9 @@ def _legend(run: RunData) -> list[str]:
         f"limits of {run.criterion}: {', '.join(limits) or 'none'}",
         "pert: share of perturbed replays that pass; pen: deepest contact, mm; "
         "N: largest force",
-        "lift, path: rise and path of the object over those of the recording",
+        "lift: rise of the object over that of the recording; worst: largest error of "
+        "a frame, mm",
+        f"half, strict: {STRICT}, half of the limits, by the replay",
     ]
     if run.baselines:
         lines.append(

@@ -22,7 +22,6 @@ from flashdex.rollouts.ledger import (
     count_faults,
     line_faults,
     read_ledger,
-    rollout_name,
 )
 from flashdex.rollouts.rollout import MADE_BY
 from flashdex.system.files import own_file
@@ -35,9 +34,11 @@ from flashdex.system.run_files import (
     SESSIONS,
     VERSIONS,
     line_counts,
+    miss_name,
     read_metrics,
     read_recipe,
     read_sessions,
+    rollout_name,
     run_id,
 )
 
@@ -219,6 +220,9 @@ class RunClaims(Notes):
         named = line.get("rollout")
         if named and named != rollout_name(line["motion"]):
             self.fault(where, f"names {named!a}, not the rollout of its motion")
+        miss = line.get("miss")
+        if miss and (miss != miss_name(line["motion"]) or line["converted"]):
+            self.fault(where, f"names {miss!a} as a miss, which it is not")
         if self.motions and line["motion"] not in self.motions:
             self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
         if line["gpu_s"] not in (0.0, line["wall_s"]):

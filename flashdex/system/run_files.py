@@ -50,10 +50,13 @@ FILES = (
 )
 CHECKPOINTS, REPLAY = "checkpoints", "checkpoints/replay"
 ROLLOUTS, FILMS, WANDB = "rollouts", "films", "wandb"
+MISSES, STARTS = "misses", "starts"
 FOLDERS = {  # -> names of its files; what else lies there is nobody's business
     CHECKPOINTS: re.compile(r"\d{12}\.(pt|unreadable)"),
     REPLAY: re.compile(r"\d{12}(\.json|-\d{1,6}\.pt)"),
     ROLLOUTS: re.compile(r".+(\.npz|\.certificate\.json)"),
+    MISSES: re.compile(r".+\.npz"),
+    STARTS: re.compile(r".+\.npz"),
     FILMS: re.compile(r".+(\.mp4|\.png)"),
     WANDB: re.compile(r"(?!)"),  # all of it is W&B's
 }
@@ -73,6 +76,11 @@ ENDED: Schema = {**_COUNTERS, "why": str, "date": str, "lines": dict}
 def rollout_name(motion: str) -> str:
     """Where a run keeps the rollout of a motion: the only place a line may name."""
     return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
+
+
+def miss_name(motion: str, folder: str = MISSES) -> str:
+    """Where a run keeps the nearest miss of a motion, its own or one to start from."""
+    return f"{folder}/{Path(rollout_name(motion)).name}"
 
 
 def check_run(run_dir: Path) -> None:

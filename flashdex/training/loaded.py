@@ -129,13 +129,14 @@ def verify(path: str | Path) -> Verification:
     except RunError as error:
         if (path / CONVERSIONS).exists():
             findings.append(Finding(CONVERSIONS, "rollouts", str(error), False))
-        verified = Verified([], [], [])
+        verified = Verified([], [], [], {})
     for one in verified.rollouts:
         if one.holds:
             files.append(f"{rollout_name(one.motion)}, {one.found}")
         elif not faults(one.findings):
             text = f"is {one.found}, no proof"
             findings.append(Finding(rollout_name(one.motion), "certificate", text))
+    files += [file for file, told in verified.misses.items() if not faults(told)]
     return Verification(path, files, [*findings, *verified.findings], why)
 
 

@@ -26,7 +26,7 @@ from flashdex.rollouts.build import grace_steps
 from flashdex.rollouts.certificate import Certificate, certify
 from flashdex.rollouts.ledger import Ledger, read_ledger
 from flashdex.rollouts.recorder import Episode
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import OF_SEARCH, Rollout
 from flashdex.rollouts.scorer import live_with_parent
 from flashdex.search.config import Rung, SearchConfig
 from flashdex.search.costs import ErrorLimits
@@ -258,16 +258,11 @@ class _Session:
         self.env_steps += found.simulated
         rollout = found.rollout
         rollout.env_steps = self.env_steps
-        spent = round(found.core_s, 3)
-        more = {
-            "rung": found.order.rung,
-            "attempt_s": spent,
-            "core_s": round(self.core_s + spent, 3),
-        }
+        spent = {"rung": found.order.rung, "attempt_s": round(found.core_s, 3)}
+        said = {**json.loads(rollout.provenance), OF_SEARCH: spent}
+        rollout.provenance = json.dumps(said)
         proof = found.certificate and found.certificate.counted(rollout)
-        line, _ = self.ledger.record(
-            rollout, wall_s=self.wall_s, certificate=proof, more=more
-        )
+        line, _ = self.ledger.record(rollout, wall_s=self.wall_s, certificate=proof)
         self._note(line)
         hours = self.wall_s / 3600
         self.log.write(

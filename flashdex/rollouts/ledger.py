@@ -66,16 +66,26 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
     Raises:
         RunError: one is no line of a ledger, or was changed; it is named.
     """
-    lines = read_lines(path, LINE)
+    lines = read_lines(path, {})
     for number, line in enumerate(lines, start=1):
-        check_name(line["motion"], what="motion", where=f"{path}: line {number}")
-        more = {key: (str, type(None)) for key in STORED if key in line}
-        searched = SEARCHED if line["source"] == "search" else {}
-        check_keys(line, {**more, **searched}, path, number)
-        errors = line["errors"]  # of a state that diverged they are not finite
-        odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
-        check_keys(errors, odd, path, number)
+        check_line(line, path, number)
     return lines
+
+
+def check_line(line: dict[str, Any], path: Path, number: int) -> None:
+    """Check that a line of a file is one of a ledger.
+
+    Raises:
+        RunError: it is not.
+    """
+    check_keys(line, LINE, path, number)
+    check_name(line["motion"], what="motion", where=f"{path}: line {number}")
+    more = {key: (str, type(None)) for key in STORED if key in line}
+    searched = SEARCHED if line["source"] == "search" else {}
+    check_keys(line, {**more, **searched}, path, number)
+    errors = line["errors"]  # of a state that diverged they are not finite
+    odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
+    check_keys(errors, odd, path, number)
 
 
 def certificate_name(motion: str) -> str:

@@ -13,7 +13,7 @@ import os
 import re
 import stat
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -44,9 +44,10 @@ BASELINES, MOTIONS = "baselines.json", "motions.json"
 METRICS, CSV, SESSIONS = "metrics.jsonl", "metrics.csv", "sessions.jsonl"
 CONVERSIONS, EVALUATION = "conversions.jsonl", "evaluation.json"
 DUMP, REPORT = "nan_dump.pt", "report.html"
+SOURCE = "source.json"  # of a search that goes on from another run
 FILES = (
     *(RECIPE, VERSIONS, DIFF, BASELINES, MOTIONS, METRICS, CSV, SESSIONS, CONVERSIONS),
-    *(EVALUATION, DUMP, REPORT, LOCK),
+    *(EVALUATION, DUMP, REPORT, SOURCE, LOCK),
 )
 CHECKPOINTS, REPLAY = "checkpoints", "checkpoints/replay"
 ROLLOUTS, FILMS, WANDB = "rollouts", "films", "wandb"
@@ -129,10 +130,13 @@ def _names(run_dir: Path, folder: str) -> list[str]:
 
 
 @contextmanager
-def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
+def new_run(
+    run_dir: Path, recipe: str, prepare: Callable[[Path], None] | None = None
+) -> Iterator[RunHold]:
     """Make the folder of a new run and hold it; nobody else may start one in it.
 
-    The recipe, YAML, comes last: a folder with one is a run.
+    The recipe, YAML, comes last: a folder with one is a run. ``prepare`` writes what
+    else the run cannot do without, into the folder that it is given.
 
     Raises:
         RunError: it holds a run, another process is at it, or it cannot be written.
@@ -148,6 +152,8 @@ def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
 
             write_object({"run": uuid.uuid4().hex, **versions()}, run_dir, VERSIONS)
             _keep_changes(run_dir)
+            if prepare is not None:
+                prepare(run_dir)
             write_recipe(run_dir, recipe)
         yield hold
 

@@ -40,7 +40,8 @@ def miss_distance(line: Line) -> tuple[bool, bool, float]:
     ]
     is_whole = line["completed"] and bool(shares)
     size = max(shares) if is_whole else 1 / max(1, line["frame"])
-    return is_unmoved(line), not is_whole, size if math.isfinite(size) else math.inf
+    is_finite = all(map(math.isfinite, shares))
+    return is_unmoved(line), not is_whole, size if is_finite else math.inf
 
 
 def is_nearer(line: Line, before: Line | None) -> bool:

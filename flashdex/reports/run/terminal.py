@@ -45,6 +45,7 @@ def run_table(run_dir: str | Path) -> str:
 
 def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     counts, recipe = count(rows), run.recipe
+    before = f"{len(run.before)} more converted by the run that it goes on from"
     shown = f"  ablation {run.ablation}" if run.ablation else ""
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
@@ -52,6 +53,7 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
         f"{counts['converted']} of {num_motions(run, rows)} converted by "
         f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust),"
         f" and {counts['trivial']} trivial, {counts['attempts']:,} attempts",
+        *([before] if run.before else []),
     ]
 
 

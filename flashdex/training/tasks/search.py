@@ -38,6 +38,7 @@ from flashdex.system.arrays import hash_content
 from flashdex.system.children import spawning_pool
 from flashdex.system.files import RunHold, own_file
 from flashdex.system.run_files import (
+    MISSES,
     STARTS,
     miss_name,
     new_run,
@@ -200,9 +201,9 @@ class _Session:
         one = self.motions[line["motion"]]
         distance = miss_distance(line)
         # what a start came to may be worse than it: then playback is tried as well
-        if not line.get("start") or distance <= one.miss:
+        if not one.has_start or distance <= one.miss:
             one.rung = max(one.rung, line.get("rung", -1))
-        one.has_start &= not line.get("start")
+        one.has_start = False
         one.miss = min(one.miss, distance)
         one.core_s += line.get("attempt_s", 0.0)
         self.core_s += line.get("attempt_s", 0.0)
@@ -227,11 +228,24 @@ class _Session:
         if not found:
             return None
         rung, _, row = min(found)
-        name = self.names[row]
+        return self._order(row, rung)
+
+    def _order(self, row: int, rung: int) -> _Order:
+        """A pass, from the nearest miss that is worth it.
+
+        The first begins at that of the run before; later ones at the run's own where
+        the object moved in it, others at playback, which then comes further.
+        """
+        name, folder = self.names[row], STARTS
+        line = self.source.starts.get(name)
         if not self.motions[name].has_start:
+            folder, line = MISSES, self.ledger.misses.get(name)
+            if line is None or is_unmoved(line) or rung == 0:
+                line = None
+        if line is None:
             return _Order(row, rung)
-        path = own_file(self.hold.path, miss_name(name, STARTS))
-        return _Order(row, rung, path, self.source.starts[name]["miss_sha256"])
+        path = own_file(self.hold.path, miss_name(name, folder))
+        return _Order(row, rung, path, line["miss_sha256"])
 
     def _end_reason(self) -> str:
         limit = self.recipe.train.wall_limit_s

@@ -41,7 +41,15 @@ def add_run_verbs(
     )
     verb.add_argument("recipe", nargs="?", help="name or path")
     add_overrides(verb)
-    verb.add_argument("--resume", type=path, metavar="RUN", help="continue a search")
+    one = verb.add_mutually_exclusive_group()
+    one.add_argument("--resume", type=path, metavar="RUN", help="continue a search")
+    one.add_argument(
+        "--from",
+        dest="source",
+        type=path,
+        metavar="RUN",
+        help="leave out what a run converted, begin at its nearest misses",
+    )
     verb.add_argument(
         "--workers", metavar="N", help="processes, the same as search.workers=N"
     )
@@ -141,7 +149,7 @@ def _search(args: argparse.Namespace) -> int:
         recipe = expect_kind(composed, SearchRecipe, where="search")
         from flashdex.training.tasks.search import search
 
-    _show_run(search(recipe, words), verb="search")
+    _show_run(search(recipe, words, args.source), verb="search")
     return 0
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from flashdex.errors import UnknownNameError
@@ -222,6 +224,17 @@ class Verdict:
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return asdict(self)
+
+
+@cache
+def limits_of(criterion: str, grace: int) -> Mapping[str, Any]:
+    """Grace and limits of a criterion, as this version has them."""
+    name = resolve_criterion(criterion)
+    for known in make_criteria(grace=grace):
+        if name in (known.name + s for s in ("", "_left", "_right")):
+            limits = {term.quantity: term.limit for term in known.terms}
+            return MappingProxyType({"grace": known.grace, **limits})
+    raise AssertionError(name)
 
 
 CriterionName = Literal[

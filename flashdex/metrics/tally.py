@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
+
+from flashdex.metrics.criteria_table import limits_of
 
 UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
 # of a motion's first pass, what a better proof of a later one replaces
 NEWEST = ("certified", "verdict", "survived")
+
+NEARER = 0.9  # of its distance an attempt may have to replace a nearest miss
 
 Line = dict[str, Any]
 
@@ -20,6 +25,48 @@ def is_trivial(line: Line) -> bool:
 def is_unmoved(line: Line) -> bool:
     """A pass in which an object stays behind its reference."""
     return UNMOVED in (line.get("trivial") or ())
+
+
+def miss_distance(line: Line) -> tuple[bool, bool, float]:
+    """How far an attempt is from a pass; the smallest is the nearest.
+
+    An object that moves comes before one that hardly does, a whole attempt before one
+    that was cut short. Whole ones differ by their worst error as a share of its limit,
+    the others by how soon they ended.
+    """
+    limits, errors = limits_of(line["criterion"], 0), line["errors"]
+    shares = [
+        value / limits[name]
+        for name, value in errors.items()
+        if name in limits and name not in ("lift", "path")
+    ]
+    is_whole = line["completed"] and bool(shares)
+    size = max(shares) if is_whole else 1 / max(1, line["frame"])
+    is_finite = all(map(math.isfinite, shares))
+    return is_unmoved(line), not is_whole, size if is_finite else math.inf
+
+
+def is_nearer(line: Line, before: Line | None) -> bool:
+    """Whether an attempt replaces a nearest miss: by a tenth at least, to write less.
+
+    One that diverged never does.
+    """
+    *kind, size = miss_distance(line)
+    if before is None:
+        return size < math.inf
+    *kind_before, size_before = miss_distance(before)
+    return (kind, size) < (kind_before, NEARER * size_before)
+
+
+def follow_misses(misses: dict[str, Line], line: Line) -> None:
+    """Take a line of a ledger into the lines that name the nearest misses, by motion.
+
+    A miss is kept until a nearer one comes, or a pass in which the object moves.
+    """
+    if line.get("miss"):
+        misses[line["motion"]] = line
+    elif line.get("rollout") and not is_unmoved(line):
+        misses.pop(line["motion"], None)
 
 
 class Tally:

@@ -71,9 +71,10 @@ class Certificate:
         return self.perturbed["pass_fraction"].get(self.identity["criterion"]) or 0.0
 
     def counted(self, rollout: Rollout) -> Certificate:
-        """The proof of the same rollout, whose env steps are known only now."""
+        """The proof of the same rollout, whose cost is known only now."""
         identity = {**self.identity, "rollout_sha256": rollout.content_sha256}
-        provenance = {**self.provenance, "env_steps": rollout.env_steps}
+        said = {**json.loads(rollout.provenance), "env_steps": rollout.env_steps}
+        provenance = {**self.provenance, **said}
         return replace(self, identity=identity, provenance=provenance)
 
     def to_json(self) -> str:

@@ -30,7 +30,14 @@ from flashdex.rollouts.resimulation import (
     simulate,
     tracked_points,
 )
-from flashdex.rollouts.rollout import MADE_BY, PROVENANCE, Rollout, bindings_of
+from flashdex.rollouts.rollout import (
+    MADE_BY,
+    OF_SEARCH,
+    PROVENANCE,
+    Rollout,
+    bindings_of,
+    is_search_part,
+)
 from flashdex.rollouts.safety import state_deviation
 from flashdex.rollouts.truth import Truth, settings_of
 from flashdex.system.machine import versions
@@ -58,11 +65,19 @@ class RolloutCheck(Notes):
         file: its name, for the findings.
         truth: recipe that it was made by, and its library; None when they are not at
             hand.
+        is_miss: it need not pass, nor last as long as its motion.
     """
 
-    def __init__(self, rollout: Rollout, file: str, truth: Truth | None) -> None:
+    def __init__(
+        self,
+        rollout: Rollout,
+        file: str,
+        truth: Truth | None,
+        *,
+        is_miss: bool = False,
+    ) -> None:
         super().__init__(file)
-        self.rollout, self.truth = rollout, truth
+        self.rollout, self.truth, self.is_miss = rollout, truth, is_miss
         self.is_sound = False  # its numbers mean something
         self.model: mujoco.MjModel | None = None  # to be simulated; None: it may not
         self._provenance = json.loads(rollout.provenance)
@@ -109,7 +124,8 @@ class RolloutCheck(Notes):
             self.fault("frames", f"{r.num_frames} of them are no motion")
         elif r.grace != grace_steps(r.fps):
             self.fault("grace", f"is {r.grace}, expected {grace_steps(r.fps)}")
-        if r.num_frames < r.reference_length and self.truth is None:
+        is_cut = r.num_frames < r.reference_length
+        if is_cut and self.truth is None and not self.is_miss:
             self.fault("frames", f"{r.num_frames} of {r.reference_length} are left")
         try:
             resolve_criterion(r.criterion)
@@ -136,7 +152,9 @@ class RolloutCheck(Notes):
     def _bound(self) -> None:
         """Hashes and limits that the file itself carries, and that it has them all."""
         r, said, made_by = self.rollout, self._provenance, self._versions
-        for name in PROVENANCE.keys() ^ said.keys():
+        if not is_search_part(said.get(OF_SEARCH, {"rung": 0, "attempt_s": 0})):
+            self.fault("provenance", f"{short(said[OF_SEARCH])} is of no search")
+        for name in PROVENANCE.keys() ^ (said.keys() - {OF_SEARCH}):
             self.fault("provenance", f"{'holds' if name in said else 'lacks'} {name!a}")
         for name in PROVENANCE.keys() & said.keys():
             if type(said[name]) is not PROVENANCE[name]:
@@ -287,8 +305,9 @@ class RolloutCheck(Notes):
     def _scores(self) -> None:
         r = self.rollout
         verdict = r.score()[resolve_criterion(r.criterion)]
-        if not verdict.is_passed:
-            self.fault("criterion", f"{verdict.name} is not passed: {verdict.reason}")
+        if verdict.is_passed == self.is_miss:
+            word = f"not passed: {verdict.reason}" if verdict.reason else "passed"
+            self.fault("criterion", f"{verdict.name} is {word}")
         expected = {k: round(v, 6) for k, v in verdict.values.items()}
         for text in differences(json.loads(r.errors), expected, tolerance=2e-6):
             self.fault("errors", text)
@@ -302,8 +321,8 @@ class RolloutCheck(Notes):
         if r.motion not in truth.bank.names:
             self.fault("motion", f"'{r.motion}' is none of the run's")
             return
-        if r.num_frames != truth.num_steps(r.motion):
-            steps = truth.num_steps(r.motion)
+        steps = truth.num_steps(r.motion)
+        if r.num_frames > steps or (r.num_frames < steps and not self.is_miss):
             self.fault("frames", f"{r.num_frames}, expected {steps}")
             return
         if r.actions.shape != (r.num_frames, 2, truth.bank.num_joints):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flashdex.errors import FlashdexError
-from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
+from flashdex.metrics.tally import UNMOVED, Tally, follow_misses, is_unmoved
 from flashdex.recipe import Recipe, RunRecipe, parse_recipe
 from flashdex.recipe.reader import parse_yaml
 from flashdex.recipe.store import DEFAULT_TASK, SEARCH_TASK
@@ -22,7 +22,6 @@ from flashdex.rollouts.ledger import (
     count_faults,
     line_faults,
     read_ledger,
-    rollout_name,
 )
 from flashdex.rollouts.rollout import MADE_BY
 from flashdex.system.files import own_file
@@ -33,11 +32,14 @@ from flashdex.system.run_files import (
     MOTIONS,
     RECIPE,
     SESSIONS,
+    SOURCE,
     VERSIONS,
     line_counts,
+    miss_name,
     read_metrics,
     read_recipe,
     read_sessions,
+    rollout_name,
     run_id,
 )
 
@@ -167,6 +169,13 @@ class RunClaims(Notes):
             return None
 
     @cached_property
+    def _starts(self) -> dict[str, Any]:
+        """Lines of another run, by motion, at whose misses a search began."""
+        found = self._read(SOURCE, lambda: read_object(self.run_dir, SOURCE), {})
+        starts = found.get("starts")
+        return starts if isinstance(starts, dict) else {}
+
+    @cached_property
     def _same_motions(self) -> bool:
         """All recipes of the run select the same motions."""
         return all(era.is_like(self.eras[-1], ("motions",)) for era in self.eras)
@@ -194,12 +203,18 @@ class RunClaims(Notes):
         path, empty = own_file(self.run_dir, CONVERSIONS), list[dict[str, Any]]()
         lines = self._read(CONVERSIONS, lambda: read_ledger(path), empty)
         wall_s = core_s = 0.0
+        misses: dict[str, dict[str, Any]] = {}
         for number, line in enumerate(lines, start=1):
             where = f"line {number}"
             if line["wall_s"] < wall_s:
                 self.fault(where, "is out of order: its wall_s is below the one before")
             wall_s = line["wall_s"]
             self._line(where, line)
+            near = self._starts.get(line["motion"]), misses.get(line["motion"])
+            hashes = ["", *(at(x, "miss_sha256") for x in near)]
+            if line.get("start", "") not in hashes:
+                self.fault(where, "begins at no miss of its motion")
+            follow_misses(misses, line)
             core_s += line.get("attempt_s", 0.0)
             if abs(line.get("core_s", core_s) - core_s) > CLOCK * number:
                 self.fault(where, "core_s is not the sum of the attempts' core-seconds")
@@ -219,6 +234,9 @@ class RunClaims(Notes):
         named = line.get("rollout")
         if named and named != rollout_name(line["motion"]):
             self.fault(where, f"names {named!a}, not the rollout of its motion")
+        miss = line.get("miss")
+        if miss and (miss != miss_name(line["motion"]) or line["converted"]):
+            self.fault(where, f"names {miss!a} as a miss, which it is not")
         if self.motions and line["motion"] not in self.motions:
             self.fault(where, f"'{line['motion']}' is no motion of {MOTIONS}")
         if line["gpu_s"] not in (0.0, line["wall_s"]):

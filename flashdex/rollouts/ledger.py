@@ -16,15 +16,28 @@ from flashdex.metrics.criteria import (
     moves_too_little,
     stays_behind,
 )
-from flashdex.metrics.tally import UNMOVED, Tally, is_unmoved
+from flashdex.metrics.criteria_table import limits_of
+from flashdex.metrics.tally import (
+    UNMOVED,
+    Tally,
+    follow_misses,
+    is_nearer,
+    is_unmoved,
+)
 from flashdex.rollouts.certificate import PROVEN, Certificate, certify
 from flashdex.rollouts.checks import RolloutCheck
-from flashdex.rollouts.rollout import MAX_FILE, Rollout, limits_of
+from flashdex.rollouts.rollout import MAX_FILE, OF_SEARCH, Rollout, is_search_part
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_file, own_folder, remove_own
 from flashdex.system.jsonl import append_line, check_keys, drop_cut_line, read_lines
 from flashdex.system.names import check_name, check_names, file_stem
-from flashdex.system.run_files import CONVERSIONS, ROLLOUTS, rollout_name
+from flashdex.system.run_files import (
+    CONVERSIONS,
+    MISSES,
+    ROLLOUTS,
+    miss_name,
+    rollout_name,
+)
 
 Source = Literal["policy", "search"]
 _LOG = logging.getLogger(__name__)
@@ -40,9 +53,13 @@ LINE: dict[str, type | tuple[type, ...]] = {
     "errors": dict,
 }
 # and those that store a rollout, besides
+OF_FILES = (
+    *("rollout", "verdict", "rollout_sha256", "certificate_sha256"),
+    *("miss", "miss_sha256"),  # of the nearest one so far
+    "start",  # SHA-256 of the file that a search began at
+)
 STORED = {
-    **dict.fromkeys(("rollout", "verdict"), (str, type(None))),
-    **dict.fromkeys(("rollout_sha256", "certificate_sha256"), (str, type(None))),
+    **dict.fromkeys(OF_FILES, (str, type(None))),
     "survived": (float, type(None)),  # share of perturbed replays
 }
 # of a search: of its ladder; core-seconds of the attempt, and of the run so far
@@ -55,16 +72,26 @@ def read_ledger(path: Path) -> list[dict[str, Any]]:
     Raises:
         RunError: one is no line of a ledger, or was changed; it is named.
     """
-    lines = read_lines(path, LINE)
+    lines = read_lines(path, {})
     for number, line in enumerate(lines, start=1):
-        check_name(line["motion"], what="motion", where=f"{path}: line {number}")
-        more = {key: kind for key, kind in STORED.items() if key in line}
-        searched = SEARCHED if line["source"] == "search" else {}
-        check_keys(line, {**more, **searched}, path, number)
-        errors = line["errors"]  # of a state that diverged they are not finite
-        odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
-        check_keys(errors, odd, path, number)
+        check_line(line, path, number)
     return lines
+
+
+def check_line(line: dict[str, Any], path: Path, number: int) -> None:
+    """Check that a line of a file is one of a ledger.
+
+    Raises:
+        RunError: it is not.
+    """
+    check_keys(line, LINE, path, number)
+    check_name(line["motion"], what="motion", where=f"{path}: line {number}")
+    more = {key: kind for key, kind in STORED.items() if key in line}
+    searched = SEARCHED if line["source"] == "search" else {}
+    check_keys(line, {**more, **searched}, path, number)
+    errors = line["errors"]  # of a state that diverged they are not finite
+    odd = {key: float for key, x in errors.items() if not isinstance(x, float)}
+    check_keys(errors, odd, path, number)
 
 
 def certificate_name(motion: str) -> str:
@@ -75,8 +102,9 @@ def certificate_name(motion: str) -> str:
 class Ledger(Tally):
     """Scores attempts, writes a line for each, stores the first that passes.
 
-    A stored rollout is on disk, complete, before its line is written: a crash can lose
-    a line, never a conversion that has a line. ``adopt`` writes the line that is lost.
+    Until a motion has one, its nearest miss is stored. A stored rollout is on disk,
+    complete, before its line is written: a crash can lose a line, never a conversion
+    that has a line. ``adopt`` writes the line that is lost.
 
     Seconds count as a GPU's where one steps the physics (``on_gpu``). Conversions get a
     certificate if ``certify``. ``trivial``: baselines that already pass a motion.
@@ -104,7 +132,16 @@ class Ledger(Tally):
         self.source = source
         self.certify, self.trivial = certify, trivial or {}
         drop_cut_line(self.path)
-        super().__init__(names, criterion, read_ledger(self.path))  # earlier sessions
+        lines = read_ledger(self.path)  # of earlier sessions
+        super().__init__(names, criterion, lines)
+        self.core_s = float(lines[-1].get("core_s", 0.0)) if lines else 0.0
+        # motion -> line of its nearest miss, where the file is the one that it names
+        self.misses: dict[str, dict[str, Any]] = {}
+        for line in lines:
+            follow_misses(self.misses, line)
+        for name, line in list(self.misses.items()):
+            if line["criterion"] != criterion or not self._has_miss(name, line):
+                del self.misses[name]
 
     def record(
         self,
@@ -113,7 +150,6 @@ class Ledger(Tally):
         wall_s: float,
         is_own: bool = True,
         certificate: Certificate | None = None,
-        more: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], bool]:
         """Score one attempt, write its line and count it.
 
@@ -124,7 +160,6 @@ class Ledger(Tally):
                 child process first.
             certificate: of the rollout, where it has been made already; where more
                 perturbed replays pass, it replaces the one before.
-            more: entries of the line that its source adds.
 
         Returns:
             The line, and whether the motion is done by this attempt.
@@ -138,7 +173,7 @@ class Ledger(Tally):
             "seed": self.seed,
             "engine": self.engine,
             "source": self.source,
-            **(more or {}),
+            **self._spent(rollout),
             "trivial": self._trivial(rollout),
         }
         before = self.conversions.get(name)
@@ -158,8 +193,44 @@ class Ledger(Tally):
             if certificate is None and self.certify:
                 certificate = _prove(rollout, is_own=is_own)
             line.update(self._store(rollout, certificate))
+        elif not (self.is_done(name) or line["converted"]) and is_nearer(
+            line, self.misses.get(name)
+        ):
+            line.update(self._keep(rollout, line))
         append_line(self.path, line)
-        return line, self.count(line)
+        self.core_s = line.get("core_s", self.core_s)
+        follow_misses(self.misses, line)
+        is_done = self.count(line)
+        if is_done:
+            remove_own(self.run_dir, miss_name(name))
+        return line, is_done
+
+    def _spent(self, rollout: Rollout) -> dict[str, Any]:
+        """What an attempt of a search says that it cost, and the run with it.
+
+        Raises:
+            RunError: it does not say so.
+        """
+        if self.source != "search":
+            return {}
+        said = json.loads(rollout.provenance).get(OF_SEARCH)
+        if not is_search_part(said):
+            raise RunError(f"{rollout.motion}: does not say what its search cost.")
+        return {**said, "core_s": round(self.core_s + said["attempt_s"], 3)}
+
+    def _has_miss(self, name: str, line: dict[str, Any]) -> bool:
+        path = own_file(self.run_dir, miss_name(name))
+        known = line["miss_sha256"]
+        return path.is_file() and hash_content(path, most=MAX_FILE) == known
+
+    def _keep(self, rollout: Rollout, line: dict[str, Any]) -> dict[str, Any]:
+        """Store the nearest miss of a motion so far; what its line says of the file."""
+        rollout.errors = json.dumps(line["errors"])
+        named = miss_name(rollout.motion)
+        path = own_file(self.run_dir, named)
+        own_folder(self.run_dir, MISSES)
+        rollout.save(path)
+        return {"miss": named, "miss_sha256": hash_content(path)}
 
     def _trivial(self, rollout: Rollout) -> list[str]:
         """Baselines that pass the motion, and whether this attempt moved too little."""
@@ -196,22 +267,34 @@ class Ledger(Tally):
         """Write the lines of stored rollouts that a crash left without one.
 
         Each is scored anew from its file alone. One that does not pass, or that is
-        damaged, stays where it is, without a line; a later conversion replaces it.
+        damaged, stays where it is, without a line; a later conversion replaces it. The
+        same with nearest misses; one whose motion has converted since is removed.
         Returns the motions told of.
         """
-        told = {x["motion"]: x for x in read_ledger(self.path) if x.get("rollout")}
         out = []
-        for name in self.names:
-            path = own_file(self.run_dir, rollout_name(name))
-            if path.is_file() and self._adopt(name, path, told.get(name), wall_s):
-                out.append(name)
+        lines = read_ledger(self.path)
+        for key, path_of in {"rollout": rollout_name, "miss": miss_name}.items():
+            told = {x["motion"]: x for x in lines if x.get(key)}
+            for name in self.names:
+                path = own_file(self.run_dir, path_of(name))
+                if not path.is_file():
+                    continue
+                if key == "miss" and self.is_done(name):
+                    remove_own(self.run_dir, path_of(name))
+                elif self._adopt(name, path, told.get(name), wall_s, key):
+                    out.append(name)
         return out
 
     def _adopt(
-        self, name: str, path: Path, line: dict[str, Any] | None, wall_s: float
+        self,
+        name: str,
+        path: Path,
+        line: dict[str, Any] | None,
+        wall_s: float,
+        key: str,
     ) -> bool:
-        """Write the line of one stored rollout, unless it has one."""
-        if line is not None and line.get("rollout_sha256") == hash_content(
+        """Write the line of one stored rollout or miss, unless it has one."""
+        if line is not None and line.get(f"{key}_sha256") == hash_content(
             path, most=MAX_FILE
         ):
             return False
@@ -222,17 +305,19 @@ class Ledger(Tally):
             # A later pass replaces the file of an unproven one: compare when it was.
             if line is not None and line["env_steps"] == rollout.env_steps:
                 raise RunError(f"{path}: was changed after its line was written.")
-            if not rollout.score()[self.criterion].is_passed:
+            is_miss = key == "miss"
+            if rollout.score()[self.criterion].is_passed == is_miss:
                 return False
-            for finding in RolloutCheck(rollout, path.name, None).run():
+            check = RolloutCheck(rollout, path.name, None, is_miss=is_miss)
+            for finding in check.run():
                 if finding.is_fault:
                     raise RunError(f"{finding}.")
+            self.record(rollout, wall_s=wall_s, is_own=False)
         except FlashdexError as error:
             if is_of_machine(error):
                 raise
             _LOG.warning("%s It is left as it is; 'flashdex verify' tells more", error)
             return False
-        self.record(rollout, wall_s=wall_s, is_own=False)
         return True
 
     @property
@@ -292,8 +377,7 @@ def line_faults(line: dict[str, Any], of_run: dict[str, Any]) -> list[str]:
 
 def _is_within(errors: dict[str, float], criterion: str) -> bool:
     """Whether these are the values of a criterion, and those with a most are below."""
-    limits = limits_of(criterion, 0)
-    del limits["grace"]
+    limits = {k: v for k, v in limits_of(criterion, 0).items() if k != "grace"}
     return errors.keys() == limits.keys() and all(
         value <= limits[name] + ROUNDED
         for name, value in errors.items()

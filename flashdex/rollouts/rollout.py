@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -18,11 +19,7 @@ import numpy as np
 from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.keys import SIDES
 from flashdex.metrics.criteria import score, worst_movement
-from flashdex.metrics.criteria_table import (
-    Verdict,
-    make_criteria,
-    resolve_criterion,
-)
+from flashdex.metrics.criteria_table import Verdict, limits_of
 from flashdex.metrics.errors import TrackingErrors, compute_tracking_errors
 from flashdex.system.archives import read_npz
 from flashdex.system.files import open_atomic
@@ -349,30 +346,33 @@ def reference_sha256(rollout: Rollout) -> str:
     return found.hexdigest()
 
 
-def limits_of(criterion: str, grace: int) -> dict[str, Any]:
-    """Grace and limits of a criterion, as this version has them."""
-    name = resolve_criterion(criterion)
-    for known in make_criteria(grace=grace):
-        if name in (known.name + s for s in ("", "_left", "_right")):
-            limits = {term.quantity: term.limit for term in known.terms}
-            return {"grace": known.grace, **limits}
-    raise AssertionError(name)
-
-
 # what the provenance of a stored rollout says
 PROVENANCE: dict[str, type] = {
     **dict.fromkeys(("run", "date", "recipe_sha256", "library_sha256"), str),
     **dict.fromkeys(("motion_sha256", "reference_sha256"), str),
     **dict.fromkeys(("physics", "limits"), dict),
 }
+# of a search also what it cost, as the line says it, see ``SEARCHED``
+OF_SEARCH = "search"
 # and its versions, those of an engine's own packages besides
 MADE_BY = ("flashdex", "torch", "torchrl", "tensordict", "mujoco", "python")
 MADE_BY += ("engine", "hardware")
+
+
+def is_search_part(said: Any) -> bool:
+    """Whether this is what a search says of an attempt: rung, core-seconds, start."""
+    kinds = {"rung": (int,), "attempt_s": (float, int), "start": (str,)}
+    return (
+        isinstance(said, dict)
+        and {"rung", "attempt_s"} <= said.keys() <= kinds.keys()
+        and all(type(value) in kinds[key] for key, value in said.items())
+        and 0 <= said["attempt_s"] < math.inf
+    )
 
 
 def bindings_of(rollout: Rollout) -> dict[str, Any]:
     """What the provenance of a rollout says of it."""
     return {
         "reference_sha256": reference_sha256(rollout),
-        "limits": limits_of(rollout.criterion, rollout.grace),
+        "limits": dict(limits_of(rollout.criterion, rollout.grace)),
     }

@@ -13,24 +13,30 @@ from typing import Any
 
 from flashdex.errors import FlashdexError, RunError, is_of_machine
 from flashdex.metrics.criteria import criterion_names, stays_behind
-from flashdex.metrics.tally import UNMOVED
+from flashdex.metrics.tally import UNMOVED, follow_misses
 from flashdex.recipe import Recipe
 from flashdex.rollouts.certificate import PROVEN, certify, compare_certificates
 from flashdex.rollouts.checks import RolloutCheck
 from flashdex.rollouts.claims import Era, RunClaims
 from flashdex.rollouts.findings import Finding, at, differences, faults
-from flashdex.rollouts.ledger import (
-    CONVERSIONS,
-    ROLLOUTS,
-    rollout_name,
-)
-from flashdex.rollouts.rollout import MAX_FILE, Rollout
+from flashdex.rollouts.rollout import MAX_FILE, OF_SEARCH, Rollout
 from flashdex.rollouts.truth import Truth
 from flashdex.system.arrays import hash_content
 from flashdex.system.files import own_files
 from flashdex.system.jsonl import read_object
 from flashdex.system.names import file_stem
-from flashdex.system.run_files import MOTIONS, RECIPE, SESSIONS, VERSIONS, check_run
+from flashdex.system.run_files import (
+    CONVERSIONS,
+    MISSES,
+    MOTIONS,
+    RECIPE,
+    ROLLOUTS,
+    SESSIONS,
+    VERSIONS,
+    check_run,
+    miss_name,
+    rollout_name,
+)
 
 CERTIFICATE = ".certificate.json"
 # of a line: what is computed from the rollout it names
@@ -60,16 +66,18 @@ class Verified:
     rollouts: list[Replayed]
     ledger: list[Finding]  # of the lines, and of files that no line names
     eras: list[Era]  # recipes of the run
+    misses: dict[str, list[Finding]]  # file of a nearest miss -> what was found
 
     @property
     def findings(self) -> list[Finding]:
         """All, those of the ledger first."""
-        return [*self.ledger, *(f for one in self.rollouts for f in one.findings)]
+        of_files = [*(one.findings for one in self.rollouts), *self.misses.values()]
+        return [finding for some in (self.ledger, *of_files) for finding in some]
 
     @property
     def holds(self) -> bool:
         """Every stored rollout is proven, and the lines are those of the run."""
-        return not faults(self.ledger) and all(one.holds for one in self.rollouts)
+        return not faults(self.findings) and all(one.holds for one in self.rollouts)
 
 
 def verify_run(run_dir: str | Path, truth: Truth | None = None) -> Verified:
@@ -115,16 +123,43 @@ class _RunCheck:
         for path in own_files(self.run_dir, ROLLOUTS, f"*{CERTIFICATE}"):
             if path.name.removesuffix(CERTIFICATE) + ".npz" not in names:
                 self.claims.fault("certificate", "of no rollout", file=self._name(path))
-        if not (files or told or faults(self.claims.findings)):
+        misses = self._misses(lines)
+        if not (files or told or misses or faults(self.claims.findings)):
             raise RunError(
                 f"{self.run_dir}: no stored rollout in '{ROLLOUTS}/'. Either nothing "
                 "has been converted yet, or this is not a run directory."
             )
         found = [self._one(file, told) for file in files]
-        return Verified(found, self.claims.findings, self.claims.eras)
+        return Verified(found, self.claims.findings, self.claims.eras, misses)
+
+    def _misses(self, lines: list[dict[str, Any]]) -> dict[str, list[Finding]]:
+        """Nearest misses by file; no conversion is counted among them."""
+        told: dict[str, dict[str, Any]] = {}
+        for line in lines:
+            follow_misses(told, line)
+        found = {
+            path: self._miss(path, told)
+            for path in own_files(self.run_dir, MISSES, "*.npz")
+        }
+        for motion in told:
+            if self.run_dir / miss_name(motion) not in found:
+                self.claims.fault(motion, f"its {miss_name(motion)} is missing")
+        return {self._name(path): findings for path, findings in found.items()}
+
+    def _miss(self, path: Path, told: dict[str, dict[str, Any]]) -> list[Finding]:
+        file = self._name(path)
+        try:
+            rollout = Rollout.load(path)
+        except FlashdexError as error:
+            return [Finding(file, "file", str(error))]
+        line = told.get(rollout.motion)
+        check, found = self._checked(file, rollout, line, is_miss=True)
+        if check.is_sound:
+            found += self._told(line, path, rollout, {}, {"miss_sha256": path})
+        return found
 
     def _name(self, path: Path) -> str:
-        return f"{ROLLOUTS}/{path.name}"
+        return path.relative_to(self.run_dir).as_posix()
 
     def _one(self, path: Path, told: dict[str, dict[str, Any]]) -> Replayed:
         file = self._name(path)
@@ -136,19 +171,34 @@ class _RunCheck:
             fault = Finding(file, "file", str(error))
             return Replayed(stem, line.get("verdict"), "not_measured", (fault,))
         line = told.get(rollout.motion)
+        check, found = self._checked(file, rollout, line)
+        verdict, stored, compared = self._certificate(path, rollout, check)
+        found += compared
+        if check.is_sound:
+            proof = path.with_name(path.stem + CERTIFICATE)
+            files = {"rollout_sha256": path, "certificate_sha256": proof}
+            found += self._told(line, path, rollout, stored, files)
+        return Replayed(rollout.motion, stored.get("verdict"), verdict, tuple(found))
+
+    def _checked(
+        self,
+        file: str,
+        rollout: Rollout,
+        line: dict[str, Any] | None,
+        *,
+        is_miss: bool = False,
+    ) -> tuple[RolloutCheck, list[Finding]]:
+        """The check of a rollout or miss, and what it and the run's files tell."""
         said = json.loads(rollout.provenance)
         recipe = said.get("recipe_sha256")
         truth, found = self._recipe(recipe, rollout.hand, file, line)
         found += self._bound(rollout, said, file, truth)
-        check = RolloutCheck(rollout, file, truth)
+        check = RolloutCheck(rollout, file, truth, is_miss=is_miss)
         found += check.run()
-        if file != rollout_name(rollout.motion):
+        named = miss_name if is_miss else rollout_name
+        if file != named(rollout.motion):
             found.append(Finding(file, "motion", f"is that of '{rollout.motion}'"))
-        verdict, stored, compared = self._certificate(path, rollout, check)
-        found += compared
-        if check.is_sound:
-            found += self._told(line, path, rollout, stored)
-        return Replayed(rollout.motion, stored.get("verdict"), verdict, tuple(found))
+        return check, found
 
     def _recipe(
         self, sha256: Any, hand: str, file: str, line: dict[str, Any] | None
@@ -237,8 +287,9 @@ class _RunCheck:
         path: Path,
         rollout: Rollout,
         stored: dict[str, Any],
+        files: dict[str, Path],
     ) -> list[Finding]:
-        """The line that names a rollout, against the files."""
+        """The line that names a rollout, against the files whose hashes it holds."""
         file = self._name(path)
         if line is None:
             text = "no line names it; if a crash left it so, 'train --resume' adds one"
@@ -250,8 +301,8 @@ class _RunCheck:
         pairs = [(key, line[key], expected[key]) for key in COUNTED]
         said, found = (_without_end(x["passed"]) for x in (line, expected))
         verdict = stored.get("verdict")
-        hashes = {"rollout_sha256": path}
-        hashes["certificate_sha256"] = path.with_name(path.stem + CERTIFICATE)
+        searched = json.loads(rollout.provenance).get(OF_SEARCH, {})
+        pairs += [(key, line.get(key), value) for key, value in searched.items()]
         pairs += [
             ("passed", said, found),
             (
@@ -271,7 +322,7 @@ class _RunCheck:
                     line.get(key),
                     hash_content(other, most=MAX_FILE) if other.is_file() else None,
                 )
-                for key, other in hashes.items()
+                for key, other in files.items()
             ),
         ]
         return [

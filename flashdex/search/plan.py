@@ -73,6 +73,8 @@ class Planner:
         limits: of the criterion.
         grace: first steps that are not scored.
         seed: of the noise, any sequence of numbers.
+        start: actions of the first steps to draw around, (S', 2, J), S' <= S; None is
+            playback, as are the steps after them.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Planner:
         limits: ErrorLimits,
         grace: int,
         seed: list[int],
+        start: NDArray[np.float32] | None = None,
     ) -> None:
         self.problem, self.config, self.rung = problem, config, rung
         self.limits, self.grace = limits, grace
@@ -95,6 +98,8 @@ class Planner:
         self._basis = np.maximum(0, 1 - np.abs(steps[:, None] - np.arange(count)))
         hands, joints = len(problem.active), problem.num_joints
         self._knots = np.zeros((count, hands, joints))
+        if start is not None:
+            self._fit(start[:, problem.active].reshape(len(start), -1))
         fingers = joints - NUM_WRIST_JOINTS
         c = config
         one = np.r_[
@@ -106,6 +111,14 @@ class Planner:
         specs = [problem.hands[SIDES[i]] for i in problem.active]
         size = rung.spread * c.squeeze_noise / c.finger_bound
         self._closing = size * np.stack([closing_directions(spec) for spec in specs])
+
+    def _fit(self, actions: NDArray[np.float32]) -> None:
+        """Set the knots that come nearest to actions of the first steps, (S', A J)."""
+        basis = self._basis[: len(actions)]
+        used = basis.any(0)
+        found, *_ = np.linalg.lstsq(basis[:, used], actions, rcond=None)
+        shape = (-1, *self._knots.shape[1:])
+        self._knots[used] = found.reshape(shape).clip(-1, 1)
 
     def _draw(self, count: int, knots: int) -> Array:
         """Noise of knots, (N, Q, A, J): partly constant, and hands that close."""

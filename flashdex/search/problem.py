@@ -25,6 +25,7 @@ from flashdex.envs.scene.perturbation import (
     worst_case,
 )
 from flashdex.envs.scene.scene import Scene
+from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandSpec
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -73,7 +74,7 @@ class Problem:
         states: map of the scene's states.
         scene: of the motion.
         row: of the motion.
-        env: scales of the actions; wrist actions must not be filtered.
+        env: scales of the actions, which are residuals; the wrist's not filtered.
         decimation: physics steps a control step.
     """
 
@@ -160,20 +161,37 @@ class Problem:
         out[..., self.active, :] = residual
         return out
 
+    @property
+    def _scale(self) -> Tensor:
+        """Size of each action, m or rad, (J,)."""
+        env = self._env
+        wrist = [env.wrist_pos_scale] * 3 + [env.wrist_rot_scale] * 3
+        fingers = [env.finger_scale] * (self.num_joints - len(wrist))
+        return torch.tensor(wrist + fingers)
+
+    def residuals(self, ctrl: Array) -> NDArray[np.float32]:
+        """Actions (T, 2, J) whose controls come nearest to any (T, nu), T <= S.
+
+        Of an attempt in any other space of actions, with a filter or another
+        feed-forward: what counts is the joint targets that it came to.
+        """
+        target = self._map.targets(torch.from_numpy(ctrl))
+        found = (target - self._target[: len(ctrl)]) / self._scale
+        return self.spread(found.clamp(-1, 1).numpy()[:, self.active])
+
     def controls(self, actions: NDArray[np.float32], first: int) -> Array:
         """Controls (N, H, nu) of actions (N, H, 2, J) from step ``first`` on."""
         n, steps = actions.shape[:2]
         flat = torch.from_numpy(actions).reshape(n * steps, 2, -1)
         ref = self._target[first : first + steps].repeat(n, 1, 1)
-        env = self._env
-        scale = [env.wrist_pos_scale] * 3 + [env.wrist_rot_scale] * 3
+        scale = self._scale
         target = joint_target(
             flat[..., :6],
             flat[..., 6:],
             ref,
             self._range,
-            wrist_scale=torch.tensor(scale),
-            finger_scale=env.finger_scale if env.finger_mode == "residual" else None,
+            wrist_scale=scale[:NUM_WRIST_JOINTS],
+            finger_scale=self._env.finger_scale,
         )
         rows = torch.full((n * steps,), self.row)
         return self._map.controls(rows, target).numpy().reshape(n, steps, -1)

@@ -13,7 +13,7 @@ import os
 import re
 import stat
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -44,16 +44,20 @@ BASELINES, MOTIONS = "baselines.json", "motions.json"
 METRICS, CSV, SESSIONS = "metrics.jsonl", "metrics.csv", "sessions.jsonl"
 CONVERSIONS, EVALUATION = "conversions.jsonl", "evaluation.json"
 DUMP, REPORT = "nan_dump.pt", "report.html"
+SOURCE = "source.json"  # of a search that goes on from another run
 FILES = (
     *(RECIPE, VERSIONS, DIFF, BASELINES, MOTIONS, METRICS, CSV, SESSIONS, CONVERSIONS),
-    *(EVALUATION, DUMP, REPORT, LOCK),
+    *(EVALUATION, DUMP, REPORT, SOURCE, LOCK),
 )
 CHECKPOINTS, REPLAY = "checkpoints", "checkpoints/replay"
 ROLLOUTS, FILMS, WANDB = "rollouts", "films", "wandb"
+MISSES, STARTS = "misses", "starts"
 FOLDERS = {  # -> names of its files; what else lies there is nobody's business
     CHECKPOINTS: re.compile(r"\d{12}\.(pt|unreadable)"),
     REPLAY: re.compile(r"\d{12}(\.json|-\d{1,6}\.pt)"),
     ROLLOUTS: re.compile(r".+(\.npz|\.certificate\.json)"),
+    MISSES: re.compile(r".+\.npz"),
+    STARTS: re.compile(r".+\.npz"),
     FILMS: re.compile(r".+(\.mp4|\.png)"),
     WANDB: re.compile(r"(?!)"),  # all of it is W&B's
 }
@@ -73,6 +77,11 @@ ENDED: Schema = {**_COUNTERS, "why": str, "date": str, "lines": dict}
 def rollout_name(motion: str) -> str:
     """Where a run keeps the rollout of a motion: the only place a line may name."""
     return f"{ROLLOUTS}/{file_stem(check_name(motion, what='motion'))}.npz"
+
+
+def miss_name(motion: str, folder: str = MISSES) -> str:
+    """Where a run keeps the nearest miss of a motion, its own or one to start from."""
+    return f"{folder}/{Path(rollout_name(motion)).name}"
 
 
 def check_run(run_dir: Path) -> None:
@@ -121,10 +130,13 @@ def _names(run_dir: Path, folder: str) -> list[str]:
 
 
 @contextmanager
-def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
+def new_run(
+    run_dir: Path, recipe: str, prepare: Callable[[Path], None] | None = None
+) -> Iterator[RunHold]:
     """Make the folder of a new run and hold it; nobody else may start one in it.
 
-    The recipe, YAML, comes last: a folder with one is a run.
+    The recipe, YAML, comes last: a folder with one is a run. ``prepare`` writes what
+    else the run cannot do without, into the folder that it is given.
 
     Raises:
         RunError: it holds a run, another process is at it, or it cannot be written.
@@ -140,6 +152,8 @@ def new_run(run_dir: Path, recipe: str) -> Iterator[RunHold]:
 
             write_object({"run": uuid.uuid4().hex, **versions()}, run_dir, VERSIONS)
             _keep_changes(run_dir)
+            if prepare is not None:
+                prepare(run_dir)
             write_recipe(run_dir, recipe)
         yield hold
 

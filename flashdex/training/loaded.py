@@ -37,6 +37,7 @@ from flashdex.system.run_files import (
     RECIPE,
     REPLAY,
     SESSIONS,
+    SOURCE,
     VERSIONS,
     check_run,
     check_sessions,
@@ -57,6 +58,7 @@ from flashdex.training.checkpoint import (
 from flashdex.training.guard import read_dump
 from flashdex.training.memory.stand_in import find_library
 from flashdex.training.run_dir import load_learner, load_run_recipe
+from flashdex.training.tasks.source import Source
 
 
 def open_truth(run_dir: str | Path) -> tuple[Truth | None, str]:
@@ -129,13 +131,14 @@ def verify(path: str | Path) -> Verification:
     except RunError as error:
         if (path / CONVERSIONS).exists():
             findings.append(Finding(CONVERSIONS, "rollouts", str(error), False))
-        verified = Verified([], [], [])
+        verified = Verified([], [], [], {})
     for one in verified.rollouts:
         if one.holds:
             files.append(f"{rollout_name(one.motion)}, {one.found}")
         elif not faults(one.findings):
             text = f"is {one.found}, no proof"
             findings.append(Finding(rollout_name(one.motion), "certificate", text))
+    files += [file for file, told in verified.misses.items() if not faults(told)]
     return Verification(path, files, [*findings, *verified.findings], why)
 
 
@@ -162,6 +165,7 @@ def read_all_files(run_dir: Path) -> tuple[list[str], list[Finding]]:
             for name in (BASELINES, MOTIONS, EVALUATION)
         },
         VERSIONS: partial(run_id, run_dir),
+        SOURCE: partial(Source.read, run_dir),
     }
     files: list[str] = []
     findings: list[Finding] = []

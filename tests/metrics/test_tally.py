@@ -1,6 +1,16 @@
 """Counts of a run from its lines."""
 
-from flashdex.metrics.tally import UNMOVED, Tally
+import math
+
+import pytest
+
+from flashdex.metrics.tally import (
+    UNMOVED,
+    Tally,
+    follow_misses,
+    is_nearer,
+    miss_distance,
+)
 
 
 def line(*trivial, verdict=None, converted=True):
@@ -34,3 +44,47 @@ def test_what_fails_or_is_of_others_does_not_count():
     lines += [{**line(), "criterion": "sr_loose"}]
     tally = Tally(["lift"], "sr_mt_obj", lines)
     assert (tally.num_passed, tally.num_attempts) == (0, 1)
+
+
+def attempt(share=0.0, frame=100, *trivial, **more):
+    """A failed attempt whose rotation is that share of its limit; 0: cut short."""
+    errors = (
+        {"object_pos": 0.0, "object_rot": share * math.radians(30)} if share else {}
+    )
+    found = {**line(*trivial, converted=False), "completed": bool(share)}
+    return {**found, "errors": errors, "frame": frame, **more}
+
+
+def test_the_nearest_miss_moves_then_lasts_then_errs_least():
+    order = [
+        attempt(1.1),
+        attempt(2.0),
+        attempt(frame=90),
+        attempt(frame=40),
+        attempt(1.01, 100, UNMOVED),
+        attempt(0, 99, UNMOVED),
+    ]
+    shuffled = order[::-1]
+    assert sorted(shuffled, key=miss_distance) == order
+    assert miss_distance(order[0])[2] == pytest.approx(1.1)
+
+
+def test_a_miss_gives_way_to_one_nearer_by_a_tenth():
+    assert is_nearer(attempt(2.0), None)
+    assert is_nearer(attempt(1.79), attempt(2.0))
+    assert not is_nearer(attempt(1.81), attempt(2.0))
+    assert is_nearer(attempt(1.9), attempt(frame=99))
+    assert not is_nearer(attempt(frame=43), attempt(frame=40))
+    assert is_nearer(attempt(frame=45), attempt(frame=40))
+    diverged = attempt(math.inf)
+    assert not is_nearer(diverged, None)
+    assert not is_nearer(attempt(math.nan), None)
+
+
+def test_a_miss_is_kept_until_its_motion_moves_in_a_pass():
+    misses, near = {}, attempt(2.0, miss="misses/lift.npz")
+    for told in (near, attempt(3.0), line(), line(UNMOVED) | {"rollout": "x"}):
+        follow_misses(misses, told)
+        assert misses == {"lift": near}
+    follow_misses(misses, line() | {"rollout": "x"})
+    assert misses == {}

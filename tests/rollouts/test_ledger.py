@@ -17,8 +17,10 @@ from flashdex.rollouts.certificate import certify
 from flashdex.rollouts.ledger import CONVERSIONS, UNMOVED, Ledger
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.verify import verify_run
+from flashdex.system.arrays import hash_content
 from flashdex.system.jsonl import append_line, read_lines, write_lines
-from flashdex.system.run_files import rollout_name
+from flashdex.system.run_files import miss_name, rollout_name
+from flashdex.training.loaded import open_truth
 
 REQUIRED = {
     "motion": str,
@@ -250,6 +252,49 @@ def test_a_proof_without_movement_proves_no_movement(
     assert ledger.note == "1 of 3 converted, 0 certified"
 
 
+def off_by(rollout, metres):
+    """The attempt with its objects that far off all the time, and moving with it."""
+    found = copy.deepcopy(rollout)
+    found.object_pos = rollout.ref_object_pos + np.array([metres, 0.0, 0.0])
+    found.object_quat = rollout.ref_object_quat.copy()
+    return found
+
+
+def test_the_nearest_miss_is_stored_until_the_motion_converts(
+    tmp_path, library, attempts, passing
+):
+    ledger, miss = open_ledger(tmp_path, library), tmp_path / miss_name("right_box")
+    stored = []
+    for i, metres in enumerate([0.5, 0.49, 0.4, 0.45, 0.1]):
+        line, _ = ledger.record(off_by(attempts[0], metres), wall_s=1.0 + i)
+        stored.append("miss" in line)
+        assert line.get("miss", "misses/right_box.npz") == "misses/right_box.npz"
+        if "miss" in line:
+            assert line["miss_sha256"] == hash_content(miss)
+    assert stored == [True, False, True, False, True]
+    kept = Rollout.load(miss)
+    assert json.loads(kept.errors)["object_pos"] == pytest.approx(0.1)
+    assert ledger.num_passed == 0
+    again = open_ledger(tmp_path, library)
+    assert "miss" not in again.record(off_by(attempts[0], 0.3), wall_s=8.0)[0]
+    assert record(again, passing, env_steps=10, wall_s=9.0)
+    assert not miss.exists()
+    assert "miss" not in again.record(off_by(attempts[0], 0.04), wall_s=9.5)[0]
+    assert not miss.exists()
+
+
+def test_a_miss_that_is_lost_or_changed_gives_way_to_the_next(
+    tmp_path, library, attempts
+):
+    ledger, miss = open_ledger(tmp_path, library), tmp_path / miss_name("right_box")
+    ledger.record(off_by(attempts[0], 0.1), wall_s=1.0)
+    for spoil in (miss.unlink, lambda: miss.write_bytes(b"hello")):
+        spoil()
+        again = open_ledger(tmp_path, library)
+        again.adopt(wall_s=2.0)
+        assert "miss" in again.record(off_by(attempts[0], 0.5), wall_s=2.0)[0]
+
+
 @pytest.mark.parametrize("name", ["../evil", "/evil", "", "a\0b", "a\nb", "x" * 300, 7])
 def test_a_name_that_is_none_makes_no_file(tmp_path, name):
     with pytest.raises(FlashdexError, match="no name of a motion"):
@@ -313,6 +358,64 @@ def test_a_rollout_without_its_line_gets_one_and_holds(orphan, truth):
     (line,) = read_lines(run / CONVERSIONS)
     assert (line["wall_s"], line["verdict"]) == (9.0, "robust")
     assert verify_run(run, truth).rollouts[0].holds
+
+
+@pytest.fixture(scope="module")
+def missed_run(start_tiny, tmp_path_factory):
+    """A finished run with a nearest miss: nobody passes by such a criterion."""
+    folder = tmp_path_factory.mktemp("missed") / "run"
+    train = {"criterion": "sr_mt_obj_moved"}
+    return start_tiny(folder, train=train, select=["right_box"])
+
+
+def test_a_miss_without_its_line_gets_one(missed_run, tmp_path):
+    run = shutil.copytree(missed_run, tmp_path / "run")
+    lines = read_lines(run / CONVERSIONS)
+    (*_, last) = (i for i, line in enumerate(lines) if line.get("miss"))
+    write_lines(run / CONVERSIONS, lines[:last])
+
+    def reopen():
+        return Ledger(
+            run, ["right_box"], criterion="sr_mt_obj_moved", seed=0, engine="cpu"
+        )
+
+    assert reopen().adopt(wall_s=9.0) == ["right_box"]
+    assert reopen().adopt(wall_s=9.0) == []
+    *before, told = read_lines(run / CONVERSIONS)
+    assert before == lines[:last]
+    assert told["miss_sha256"] == hash_content(run / miss_name("right_box"))
+    unknown = {"wall_s": 0, "completed": 0, "why": 0, "miss_sha256": 0}  # not in it
+    assert told | unknown == lines[last] | unknown
+    assert reopen().num_passed == 0
+
+
+MISSED = {
+    "flipped": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "file:"),
+    "gone": (lambda path: path.unlink(), "is missing"),
+    "its actions": (
+        lambda path: tamper_with(path, actions=tamper.load(path)["actions"] * 0.9),
+        "ctrl: is up to",
+    ),
+    "another name": (
+        lambda path: path.rename(path.with_name("left_ball.npz")),
+        "is that of 'right_box'",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", MISSED)
+def test_a_miss_that_is_not_as_it_was_stored_is_found(missed_run, tmp_path, damage):
+    run, (spoil, told) = shutil.copytree(missed_run, tmp_path / "run"), MISSED[damage]
+    truth, _ = open_truth(run)
+    verified = verify_run(run, truth)
+    assert verified.holds
+    assert list(verified.misses) == ["misses/right_box.npz"]
+    assert verified.rollouts == []
+    spoil(run / miss_name("right_box"))
+    found = [str(f) for f in verify_run(run, truth).findings if f.is_fault]
+    assert any(told in text for text in found), found
+    is_changed = damage in ("its actions",)
+    assert not is_changed or any("miss_sha256" in text for text in found)
 
 
 DAMAGES = {

@@ -14,11 +14,10 @@ LIMITS = ErrorLimits.of("sr_mt_obj")
 CHEAP = Rung(samples=4, rounds=1, horizon=8)
 
 
-def plan(problem, rung=CHEAP, seed=(0,), grace=15, limits=LIMITS, **fields):
+def plan(problem, rung=CHEAP, seed=(0,), grace=15, limits=LIMITS, start=None, **fields):
     config = dataclasses.replace(SearchConfig(), **fields)
-    return Planner(
-        problem, config, rung, limits=limits, grace=grace, seed=list(seed)
-    ).run()
+    given = {"limits": limits, "grace": grace, "seed": list(seed), "start": start}
+    return Planner(problem, config, rung, **given).run()
 
 
 def test_a_plan_follows_from_its_seed(make_problem):
@@ -34,6 +33,20 @@ def test_without_noise_a_plan_is_playback(make_problem):
     fields = ("wrist_pos_noise", "wrist_rot_noise", "finger_noise", "squeeze_noise")
     found = plan(make_problem("right_box"), **dict.fromkeys(fields, 0.0))
     assert not found.actions.any()
+
+
+def test_without_noise_a_plan_is_where_it_starts(make_problem):
+    """Actions that are linear between knots come back; behind them is playback."""
+    problem = make_problem("right_box")
+    fields = ("wrist_pos_noise", "wrist_rot_noise", "finger_noise", "squeeze_noise")
+    still = dict.fromkeys(fields, 0.0)
+    ramp = np.linspace(0, 0.08, 9)[:, None, None].repeat(problem.num_joints, 2)
+    start = problem.spread(ramp)
+    found = plan(problem, start=start, **still)
+    np.testing.assert_allclose(found.actions[:9], start, atol=1e-6)
+    assert not found.actions[12:].any()
+    noise = np.random.default_rng(0).normal(size=start.shape).astype(np.float32)
+    assert np.abs(plan(problem, start=start + noise, **still).actions).max() <= 1
 
 
 def test_a_pass_beyond_its_limits_is_given_up(make_problem):

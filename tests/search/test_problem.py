@@ -90,6 +90,22 @@ def test_fingertips_lie_where_kinematics_says(make_problem, bank, hands):
     np.testing.assert_allclose(problem.ref_tips, own.numpy(), atol=2e-5)
 
 
+@pytest.mark.parametrize("name", MOTIONS)
+def test_actions_are_found_again_from_their_controls(make_problem, name):
+    """Also those of another space: where they are within reach, the controls agree."""
+    problem = make_problem(name)
+    actions = draw_actions(problem)
+    ctrl = problem.controls(actions, 0)
+    found = problem.residuals(ctrl[0])
+    np.testing.assert_allclose(problem.controls(found[None], 0), ctrl, atol=1e-6)
+    inside = np.abs(found) < 0.99
+    inside[:] &= np.abs(found - actions[0]) < 1e-3  # a joint limit cuts some
+    assert inside[:, problem.active].mean() > 0.9
+    far = problem.residuals(ctrl[0, :7] + 100.0)
+    assert (far[:, problem.active] == 1).all()
+    assert not far[:, [i for i in range(2) if i not in problem.active]].any()
+
+
 def test_shares_are_errors_over_limits(make_problem):
     problem = make_problem("right_box")
     trial = problem.simulate(problem.worlds(1), draw_actions(problem))

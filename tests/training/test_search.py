@@ -1,6 +1,9 @@
 """Runs of the search: conversions that verify, and nothing done twice or lost."""
 
 import dataclasses
+import shutil
+from hashlib import sha256
+from pathlib import Path
 
 import pytest
 
@@ -8,8 +11,10 @@ from flashdex.cli.main import main
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
 from flashdex.recipe import LoggerConfig, MotionsConfig, SearchRecipe, validate
+from flashdex.reports.run.terminal import run_table
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.search.config import Rung, SearchConfig
+from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.run_files import read_metrics, read_sessions
 from flashdex.training.loaded import verify
 from flashdex.training.run_dir import train
@@ -140,3 +145,76 @@ def test_the_command_composes_a_recipe_for_the_search(capsys):
     assert "physics.engine" in told
     assert main(["train", "quickstart", "search.stride=4"]) == 2
     assert "task: search" in capsys.readouterr().err
+
+
+@pytest.fixture
+def left(recipe, inline, monkeypatch):
+    """A search by playback alone: one motion is done, two come near."""
+    from flashdex.rollouts import ledger
+
+    # objects of these motions hardly move, and such passes are not the last word
+    monkeypatch.setattr(ledger, "stays_behind", lambda errors: False)
+    playback = dataclasses.replace(LADDERS, ladder=[Rung(samples=2, horizon=12)])
+    train = dataclasses.replace(recipe.train, criterion="sr_mt_obj_x0.5", certify=False)
+    found = dataclasses.replace(recipe, search=playback, train=train)
+    run = search(found)
+    told = {x["motion"]: bool(x.get("miss")) for x in read_ledger(run / CONVERSIONS)}
+    assert told == {"right_box": False, "left_ball": True, "both": True}
+    return run, dataclasses.replace(
+        found, search=LADDERS, run_dir=recipe.run_dir + "-more"
+    )
+
+
+def test_a_search_goes_on_from_what_a_run_left(left, monkeypatch):
+    """Its run may be deleted; the misses come first, each from where it was."""
+    source, recipe = left
+    misses = {path.stem: path.read_bytes() for path in (source / "misses").iterdir()}
+    asked = []
+    make = searching.Planner
+
+    def planner(problem, *given, start, **more):
+        asked.append((problem.row, start))
+        return make(problem, *given, start=start, **more)
+
+    monkeypatch.setattr(searching, "Planner", planner)
+    take = searching._Session._take
+
+    def dying(self, found, progress):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(searching._Session, "_take", dying)
+    with pytest.raises(KeyboardInterrupt):
+        search(recipe, source=source)
+    monkeypatch.setattr(searching._Session, "_take", take)
+    shutil.rmtree(source)
+    run = resume_search(recipe.run_dir)
+    lines = read_ledger(run / CONVERSIONS)
+    assert {x["motion"] for x in lines} == {"left_ball", "both"}
+    begun = {x["motion"]: x["start"] for x in lines if x["rung"] == 0 and "start" in x}
+    assert begun == {n: sha256(data).hexdigest() for n, data in misses.items()}
+    started = [start for _, start in asked if start is not None]
+    assert len(started) == len(begun) + 1  # one of them was lost with the kill
+    assert all(0 < len(start) <= 51 for start in started)
+    assert "1 more converted by the run" in run_table(run)
+    assert resume_search(run) == run
+    assert len(read_ledger(run / CONVERSIONS)) == len(lines)
+    source_file = run / "starts/both.npz"
+    source_file.write_bytes(source_file.read_bytes()[:-1])
+    assert main(["search", "--resume", str(run)]) == 2
+
+
+def test_a_run_of_other_things_is_no_source(left, capsys):
+    source, recipe = left
+    physics = dataclasses.replace(recipe.physics, object_friction=0.5, iterations=7)
+    other = dataclasses.replace(recipe, physics=physics)
+    with pytest.raises(FlashdexError, match=r"object_friction is 2\.0, expected 0\.5"):
+        search(other, source=source)
+    train = dataclasses.replace(recipe.train, criterion="sr_mt")
+    with pytest.raises(FlashdexError, match=r"its train\.criterion is sr_mt_obj_x0\.5"):
+        search(dataclasses.replace(recipe, train=train), source=source)
+    known = read_object(source, "motions.json")["motions"]
+    write_object({"motions": known | {"both": "0" * 64}}, source, "motions.json")
+    with pytest.raises(FlashdexError, match="another content of 1 motions, 'both'"):
+        search(recipe, source=source)
+    assert not Path(recipe.run_dir).exists()
+    assert main(["search", "x", "--from", str(source), "--resume", str(source)]) == 2

@@ -141,6 +141,10 @@ class StateMap(nn.Module):
         out[:, self.ctrl_of_joint] = ctrl[:, self._hands]
         return out
 
+    def targets(self, ctrl: Tensor) -> Tensor:
+        """Joint targets (N, 2, J) of controls (N, nu); the inverse of ``controls``."""
+        return self._per_hand(ctrl[:, self.ctrl_of_joint])
+
     def _per_hand(self, values: Tensor) -> Tensor:
         """Both hands from those that exist: (N, S, J) to (N, 2, J)."""
         if values.shape[1] == 2:

@@ -20,6 +20,7 @@ from flashdex.system.run_files import (
     CONVERSIONS,
     RECIPE,
     ROLLOUTS,
+    SOURCE,
     VERSIONS,
     check_run,
     check_sessions,
@@ -49,6 +50,8 @@ class RunData:
     attempts: list[Line]  # lines of ``conversions.jsonl``, oldest first
     baselines: dict[str, dict[str, Line]]  # baseline -> motion -> score
     certificates: dict[str, Line]  # motion -> certificate, of stored rollouts
+    # motions that the run converted which a search goes on from, and are left out
+    before: frozenset[str] = frozenset()
 
     @property
     def criterion(self) -> str:
@@ -99,7 +102,17 @@ def load_run(run_dir: str | Path) -> RunData:
         attempts=read_lines(path / CONVERSIONS, ATTEMPT),
         baselines=_baselines(path),
         certificates=_certificates(path),
+        before=frozenset(_converted_before(path)),
     )
+
+
+def _converted_before(path: Path) -> Line:
+    found = read_object(path, SOURCE).get("converted", {})
+    if not isinstance(found, dict):
+        raise RunError(
+            f"{path / SOURCE}: names no conversions. Restore it from a copy."
+        )
+    return found
 
 
 def _baselines(path: Path) -> dict[str, dict[str, Line]]:
@@ -263,7 +276,8 @@ class MotionFacts:
         And how far the motion came, if no attempt reached its end.
         """
         if not self.lines:
-            return "not attempted"
+            is_before = self.name in self.run.before
+            return "converted by the run before" if is_before else "not attempted"
         failed = [line for line in self.lines if not line.get("converted")]
         causes = Counter(cause for line in failed for cause in _why(line))
         why = ""

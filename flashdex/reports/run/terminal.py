@@ -49,6 +49,7 @@ def run_table(run_dir: str | Path) -> str:
 
 def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
     counts, recipe = count(rows), run.recipe
+    before = f"{len(run.before)} more converted by the run that it goes on from"
     shown = f"  ablation {run.ablation}" if run.ablation else ""
     return [
         f"{recipe.get('name', run.path.name)}{shown}  hand {recipe.get('hand', '?')}  "
@@ -58,6 +59,7 @@ def _headline(run: RunData, rows: list[MotionFacts]) -> list[str]:
         f"{run.criterion}, {counts['certified']} certified ({counts['robust']} robust, "
         f"{counts['strict']} strict), and {counts['trivial']} trivial, "
         f"{counts['attempts']:,} attempts",
+        *([before] if run.before else []),
     ]
 
 

@@ -11,30 +11,36 @@ from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from flashdex.envs.physics.state_map import StateMap
 from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
 from flashdex.errors import FlashdexError, RunError
-from flashdex.metrics.tally import is_unmoved
+from flashdex.metrics.tally import is_unmoved, miss_distance
 from flashdex.recipe import SearchRecipe, dump_recipe, expect_kind
 from flashdex.rollouts.build import grace_steps
 from flashdex.rollouts.certificate import Certificate, certify
 from flashdex.rollouts.ledger import Ledger, read_ledger
 from flashdex.rollouts.recorder import Episode
-from flashdex.rollouts.rollout import Rollout
+from flashdex.rollouts.rollout import MAX_FILE, OF_SEARCH, Rollout
 from flashdex.rollouts.scorer import live_with_parent
 from flashdex.search.config import Rung, SearchConfig
-from flashdex.search.costs import ErrorLimits
+from flashdex.search.costs import ErrorLimits, shares
 from flashdex.search.plan import Planner
-from flashdex.search.problem import Problem
+from flashdex.search.problem import Problem, Trial
+from flashdex.system.arrays import hash_content
 from flashdex.system.children import spawning_pool
-from flashdex.system.files import RunHold
+from flashdex.system.files import RunHold, own_file
 from flashdex.system.run_files import (
+    MISSES,
+    STARTS,
+    miss_name,
     new_run,
     refuse_old_run,
     reported,
@@ -50,6 +56,12 @@ from flashdex.training.session import (
     end_session,
     interruptible,
 )
+from flashdex.training.tasks.source import (
+    Source,
+    forget_source,
+    read_source,
+    take_over,
+)
 from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Progress
 
@@ -58,15 +70,19 @@ KEPT = 4  # problems that a worker keeps
 WAIT_S = 0.5  # between looks at signals
 
 
-def search(recipe: SearchRecipe, overrides: Collection[str] = ()) -> Path:
+def search(
+    recipe: SearchRecipe, overrides: Collection[str] = (), source: Path | None = None
+) -> Path:
     """Search for the motions of a recipe from the beginning; return the run directory.
 
     Args:
         recipe: composed with ``task=search``.
         overrides: ``key=value`` words it was composed with, for the run's records.
+        source: run to go on from: what it converted is left out, and a motion begins
+            at its nearest miss.
 
     Raises:
-        RunError: the folder already holds a run.
+        RunError: the folder already holds a run, or ``source`` is one of other things.
     """
     recipe = recipe.in_action_space()
     named = f"runs/{recipe.name}-search-s{recipe.seed}"
@@ -75,7 +91,11 @@ def search(recipe: SearchRecipe, overrides: Collection[str] = ()) -> Path:
     check_writers(recipe)
     with interruptible():
         task = TrackingTask(RunBuilder.from_recipe(recipe))
-    with new_run(run_dir, dump_recipe(recipe)) as hold:
+    prepare = forget_source
+    if source is not None:
+        found = read_source(source, recipe, task.contents)
+        prepare = partial(take_over, source, found)
+    with new_run(run_dir, dump_recipe(recipe), prepare) as hold:
         return _run(task, hold, list(overrides))
 
 
@@ -97,6 +117,7 @@ def resume_search(run: str | Path) -> Path:
 
 def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
     run_dir, why = hold.path, "error"
+    source = Source.read(run_dir)
     with reported(run_dir):
         ledger = task.open_ledger(run_dir, source="search")
         lines = read_ledger(ledger.path)
@@ -104,7 +125,7 @@ def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
         start = begin_session(run_dir, env_steps=done, wall_s=0.0, overrides=overrides)
         ledger.adopt(wall_s=start.wall_s)
         log = MetricLog(run_dir, task.recipe)
-        session = _Session(task, ledger, log, hold, start.run, start.wall_s)
+        session = _Session(task, ledger, log, hold, source, start.run, start.wall_s)
         try:
             why = session.run()
         finally:
@@ -127,7 +148,8 @@ class _Progress:
     rung: int = -1  # the last one that was tried
     core_s: float = 0.0
     robust_s: float = 0.0  # of these, by the robust ladder
-    miss: float = float("inf")  # least worst error of a whole plan, in limits
+    miss: tuple[bool, bool, float] = (True, True, float("inf"))  # how far from a pass
+    has_start: bool = False  # a miss of another run, not tried yet
 
 
 @dataclass(frozen=True)
@@ -136,6 +158,8 @@ class _Order:
 
     row: int
     rung: int  # place among the passes of the ladder, then of the robust one
+    start: Path | None = None  # rollout to draw around
+    start_sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -157,6 +181,7 @@ class _Session:
     ledger: Ledger
     log: MetricLog
     hold: RunHold
+    source: Source  # the run before it
     run_id: str
     wall_s: float  # of the run when the session began, then so far
     env_steps: int = 0
@@ -168,9 +193,11 @@ class _Session:
         self.search: SearchConfig = self.recipe.search
         self.first_robust = len(every_pass(self.search.ladder))
         self.num_passes = self.first_robust + len(every_pass(self.search.robust_ladder))
-        self.limits = ErrorLimits.of(self.recipe.train.criterion)
         self.names = self.task.builder.bank.names
         self.motions = {name: _Progress() for name in self.names}
+        for name in self.source.starts.keys() & self.motions.keys():
+            miss = miss_distance(self.source.starts[name])
+            self.motions[name] = _Progress(miss=miss, has_start=True)
         for line in read_ledger(self.ledger.path):
             if line["motion"] in self.motions:
                 self._note(line)
@@ -179,38 +206,57 @@ class _Session:
     def _note(self, line: dict[str, Any]) -> None:
         """Count an attempt: what it cost, and how near it came."""
         one = self.motions[line["motion"]]
-        one.rung = max(one.rung, line.get("rung", -1))
-        spent = line.get("attempt_s", 0.0)
+        distance, spent = miss_distance(line), line.get("attempt_s", 0.0)
+        rung = line.get("rung", -1)
+        # what a start came to may be worse than it: then playback is tried as well
+        if not one.has_start or distance <= one.miss:
+            one.rung = max(one.rung, rung)
+        one.has_start = False
+        one.miss = min(one.miss, distance)
         one.core_s += spent
         self.core_s += spent
-        if line.get("rung", -1) >= self.first_robust:
+        if rung >= self.first_robust:
             one.robust_s += spent
         self.env_steps = max(self.env_steps, line["env_steps"])
-        if line["completed"] and not is_unmoved(line):
-            errors = line["errors"]
-            pos, rot = (errors.get(f"object_{k}", 9.0) for k in ("pos", "rot"))
-            worst = max(pos / self.limits.pos, rot / self.limits.rot)
-            one.miss = min(one.miss, worst)
 
     def _next(self, busy: set[str]) -> _Order | None:
         """The cheapest rung that is left, of it the motion that came nearest."""
         found = []
         for row, name in enumerate(self.names):
             one, before = self.motions[name], self.ledger.conversions.get(name)
-            if name in busy:
+            if name in self.source.converted or name in busy:
                 continue
             if before is None or is_unmoved(before):
-                rung, last, near = one.rung + 1, self.first_robust, one.miss
-                spent = one.core_s >= self.search.budget_s
+                rung, last = one.rung + 1, self.first_robust
+                near, spent = one.miss, one.core_s >= self.search.budget_s
             else:
                 rung, last = max(one.rung + 1, self.first_robust), self.num_passes
-                near = -(before.get("survived") or 0.0)
+                near = (False, False, -(before.get("survived") or 0.0))
                 spent = one.robust_s >= self.search.robust_budget_s
                 spent = spent or before.get("verdict") == "robust"
             if rung < last and not spent:
                 found.append((rung, near, row))
-        rung, _, row = min(found, default=(0, 0.0, -1))
-        return None if row < 0 else _Order(row, rung)
+        if not found:
+            return None
+        rung, _, row = min(found)
+        return self._order(row, rung)
+
+    def _order(self, row: int, rung: int) -> _Order:
+        """A pass, from the nearest miss that is worth it.
+
+        The first begins at that of the run before; later ones at the run's own where
+        the object moved in it, others at playback, which then comes further.
+        """
+        name, folder = self.names[row], STARTS
+        line = self.source.starts.get(name)
+        if not self.motions[name].has_start:
+            folder, line = MISSES, self.ledger.misses.get(name)
+            if line is None or is_unmoved(line) or rung == 0:
+                line = None
+        if line is None:
+            return _Order(row, rung)
+        path = own_file(self.hold.path, miss_name(name, folder))
+        return _Order(row, rung, path, line["miss_sha256"])
 
     def _end_reason(self) -> str:
         limit = self.recipe.train.wall_limit_s
@@ -226,7 +272,7 @@ class _Session:
         count = max(1, min(count, len(self.names)))
         progress = Progress(
             self.recipe.name,
-            total=len(self.names),
+            total=len(set(self.names) - self.source.converted.keys()),
             done=len(self.ledger.done),
             unit="motion",
         )
@@ -271,16 +317,13 @@ class _Session:
         self.env_steps += found.simulated
         rollout = found.rollout
         rollout.env_steps = self.env_steps
-        spent = round(found.core_s, 3)
-        more = {
-            "rung": found.order.rung,
-            "attempt_s": spent,
-            "core_s": round(self.core_s + spent, 3),
-        }
+        spent = {"rung": found.order.rung, "attempt_s": round(found.core_s, 3)}
+        if found.order.start is not None:
+            spent["start"] = found.order.start_sha256
+        said = {**json.loads(rollout.provenance), OF_SEARCH: spent}
+        rollout.provenance = json.dumps(said)
         proof = found.certificate and found.certificate.counted(rollout)
-        line, _ = self.ledger.record(
-            rollout, wall_s=self.wall_s, certificate=proof, more=more
-        )
+        line, _ = self.ledger.record(rollout, wall_s=self.wall_s, certificate=proof)
         self._note(line)
         hours = self.wall_s / 3600
         self.log.write(
@@ -330,6 +373,23 @@ class _Worker:
             decimation=recipe.physics.decimation,
         )
 
+    def _start(self, order: _Order, problem: Problem) -> NDArray[np.float32] | None:
+        """Actions of the rollout that an order names, until its object is lost."""
+        path = order.start
+        if path is None:
+            return None
+        if hash_content(path, most=MAX_FILE) != order.start_sha256:
+            raise RunError(f"{path}: was changed while the search was at work.")
+        rollout = Rollout.load(path)
+        ctrl = rollout.ctrl[: problem.steps]
+        if ctrl.shape[1] != problem.model.nu or not np.isfinite(ctrl).all():
+            raise RunError(f"{path}: holds no controls of this motion's scene.")
+        poses = rollout.object_pos, rollout.object_quat
+        pos, quat = (x[None, None, : len(ctrl), problem.slots] for x in poses)
+        error = shares(Trial(pos, quat, pos, pos), problem, 0, self.limits).worst[0, 0]
+        near = np.flatnonzero(error <= 1)
+        return problem.residuals(ctrl)[: near.max(initial=0) + 1]
+
     def work(self, order: _Order) -> _Found:
         """Plan one motion by one rung, score it, and certify what passes."""
         begun, search = time.process_time(), self.recipe.search
@@ -343,6 +403,7 @@ class _Worker:
             limits=self.limits,
             grace=grace_steps(self.builder.bank.fps),
             seed=[self.recipe.seed, order.row, order.rung],
+            start=self._start(order, problem),
         ).run()
         episode = Episode(
             env=0,

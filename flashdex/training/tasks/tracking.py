@@ -111,7 +111,7 @@ class TrackingTask(Task):
             RunError: the library was changed or exchanged.
         """
         known = read_object(run_dir, MOTIONS).get("motions", {})
-        now = self._contents
+        now = self.contents
         others = [name for name in now if known.get(name, now[name]) != now[name]]
         if others:
             raise RunError(
@@ -121,15 +121,15 @@ class TrackingTask(Task):
             )
 
     @cached_property
-    def _contents(self) -> dict[str, str]:
+    def contents(self) -> dict[str, str]:
         """Hash of the content of each motion, by name."""
         library = self.builder.library
         return {n: library.motion_hash(row) for row, n in enumerate(library.names)}
 
     def _remember_motions(self, run_dir: Path) -> None:
         known = read_object(run_dir, MOTIONS).get("motions", {})
-        if not self._contents.keys() <= known.keys():
-            everything = {"motions": {**known, **self._contents}}
+        if not self.contents.keys() <= known.keys():
+            everything = {"motions": {**known, **self.contents}}
             write_object(everything, run_dir, MOTIONS)
 
     def prepare(self, run_dir: Path, env: TrackingEnv) -> None:

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 from flashdex.system.fields import number
+
+SampleEngine = Literal["cpu", "warp"]
+# On a GPU a rollout of one world takes as long as one of a thousand.
+SAMPLES_FACTOR: dict[SampleEngine, int] = {"cpu": 1, "warp": 64}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +87,11 @@ class SearchConfig:
     """Cost of changes between knots, in standard deviations squared."""
     end_weight: float = number(1.0, low=0, high=1000)
     """Weight added to the last quarter of the horizon."""
+    engine: SampleEngine = "cpu"
+    """Who tries the samples: cpu = MuJoCo C; warp = MuJoCo Warp on one NVIDIA GPU, which
+    ``physics=warp`` sets. What is found is played, scored and certified in MuJoCo C."""
+    samples_factor: int | None = number(None, low=1, high=10_000)
+    """Factor of the samples of every rung; null = 1 for cpu, 64 for warp."""
     budget_s: float = number(60.0, above=0, high=1e7)
     """Core-seconds of a motion; a rung that has begun is finished."""
     workers: int = number(0, low=0, high=1024)
@@ -91,3 +101,12 @@ class SearchConfig:
     robust_ladder: list[Rung] = dataclasses.field(default_factory=_robust_ladder)
     """Those tried then, in several worlds, until a plan survives perturbations, too;
     empty = one that passes is enough."""
+
+    @property
+    def rungs(self) -> list[Rung]:
+        """Both ladders, one behind the other, with the samples that are drawn."""
+        factor = self.samples_factor or SAMPLES_FACTOR[self.engine]
+        return [
+            dataclasses.replace(rung, samples=rung.samples * factor)
+            for rung in (*self.ladder, *self.robust_ladder)
+        ]

@@ -28,10 +28,11 @@ from flashdex.rollouts.ledger import Ledger, read_ledger
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import Rollout
 from flashdex.rollouts.scorer import live_with_parent
-from flashdex.search.config import Rung, SearchConfig
+from flashdex.search.config import SearchConfig
 from flashdex.search.costs import ErrorLimits
 from flashdex.search.plan import Planner
 from flashdex.search.problem import Problem
+from flashdex.search.simulate import make_simulator
 from flashdex.system.children import spawning_pool
 from flashdex.system.files import RunHold
 from flashdex.system.run_files import (
@@ -73,8 +74,7 @@ def search(recipe: SearchRecipe, overrides: Collection[str] = ()) -> Path:
     run_dir = Path(recipe.run_dir or named)
     refuse_old_run(run_dir)
     check_writers(recipe)
-    with interruptible():
-        task = TrackingTask(RunBuilder.from_recipe(recipe))
+    task = _make_task(recipe)
     with new_run(run_dir, dump_recipe(recipe)) as hold:
         return _run(task, hold, list(overrides))
 
@@ -89,10 +89,15 @@ def resume_search(run: str | Path) -> Path:
     recipe = expect_kind(load_run_recipe(run_dir), SearchRecipe, where=str(run_dir))
     check_writers(recipe)
     with resumed_run(run_dir) as hold:
-        with interruptible():
-            task = TrackingTask(RunBuilder.from_recipe(recipe))
+        task = _make_task(recipe)
         task.check_inputs(run_dir)
         return _run(task, hold, [])
+
+
+def _make_task(recipe: SearchRecipe) -> TrackingTask:
+    make_simulator(recipe.search.engine, recipe.physics)  # here it says what is missing
+    with interruptible():
+        return TrackingTask(RunBuilder.from_recipe(recipe))
 
 
 def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
@@ -160,7 +165,7 @@ class _Session:
     def __post_init__(self) -> None:
         self.recipe = expect_kind(self.task.recipe, SearchRecipe, where="search")
         self.search: SearchConfig = self.recipe.search
-        self.rungs = [*self.search.ladder, *self.search.robust_ladder]
+        self.rungs = self.search.rungs
         self.limits = ErrorLimits.of(self.recipe.train.criterion)
         self.names = self.task.builder.bank.names
         self.motions = {name: _Progress() for name in self.names}
@@ -210,6 +215,8 @@ class _Session:
     def run(self) -> str:
         """Search until nothing is left to try, or something ends it; return why."""
         count = self.search.workers or len(os.sched_getaffinity(0))
+        if self.search.engine == "warp":  # its worlds fill the device
+            count = 1
         count = max(1, min(count, len(self.names)))
         progress = Progress(
             self.recipe.name,
@@ -299,6 +306,7 @@ class _Worker:
         self.builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
         self.layout = SceneLayout.of(self.builder.library)
         self.limits = ErrorLimits.of(recipe.train.criterion)
+        self.simulator = make_simulator(recipe.search.engine, recipe.physics)
         self.provenance = provenance
         self.problem = lru_cache(KEPT)(self._problem)
 
@@ -315,6 +323,7 @@ class _Worker:
             row,
             env=recipe.env,
             decimation=recipe.physics.decimation,
+            simulator=self.simulator,
         )
 
     def work(self, order: _Order) -> _Found:
@@ -322,11 +331,10 @@ class _Worker:
         begun, search = time.process_time(), self.recipe.search
         problem = self.problem(order.row)
         before = problem.simulated
-        rungs: list[Rung] = [*search.ladder, *search.robust_ladder]
         plan = Planner(
             problem,
             search,
-            rungs[order.rung],
+            search.rungs[order.rung],
             limits=self.limits,
             grace=grace_steps(self.builder.bank.fps),
             seed=[self.recipe.seed, order.row, order.rung],

@@ -1,0 +1,110 @@
+"""Who plays controls in worlds: MuJoCo C, or MuJoCo Warp with thousands at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from flashdex.search.config import SampleEngine
+
+if TYPE_CHECKING:
+    from flashdex.envs.physics.config import PhysicsConfig
+    from flashdex.envs.physics.warp.rollout import WarpRollout
+
+FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """Where sequences of actions are tried: the nominal world first, K in all."""
+
+    models: list[mujoco.MjModel]
+    states: Array  # full physics states, (K, .)
+    noise: Array  # added to the controls of the whole motion, (K, S, nu)
+
+    def after(self, states: Array) -> Worlds:
+        """The same worlds in other states, (K, .)."""
+        return Worlds(self.models, states, self.noise)
+
+
+class Simulator(Protocol):
+    """Plays N sequences of H controls in each of K worlds."""
+
+    def __call__(
+        self, worlds: Worlds, ctrl: Array, first: int
+    ) -> tuple[Array, Array]:
+        """Play controls (N, H, nu) from the worlds' states, at control step ``first``.
+
+        Returns:
+            Full physics states after each control step and the sensors of its last
+            substep, (N, K, H, .).
+        """
+        ...
+
+
+class MujocoC:
+    """MuJoCo C in the calling thread, for the worlds of one scene."""
+
+    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
+        self._data, self._substeps = mujoco.MjData(model), substeps
+
+    def __call__(
+        self, worlds: Worlds, ctrl: Array, first: int
+    ) -> tuple[Array, Array]:
+        """Play controls; see ``Simulator``."""
+        n, steps = ctrl.shape[:2]
+        count, substeps = len(worlds.models), self._substeps
+        ctrl = ctrl[:, None] + worlds.noise[None, :, first : first + steps]
+        ctrl = np.repeat(ctrl.reshape(n * count, steps, -1), substeps, axis=1)
+        models = worlds.models[0] if count == 1 else worlds.models * n
+        start = np.tile(worlds.states, (n, 1))
+        states, sensors = (
+            x[:, substeps - 1 :: substeps].reshape(n, count, steps, x.shape[-1])
+            for x in rollout.rollout(models, self._data, start, ctrl)
+        )
+        return states, sensors
+
+
+class Warp:
+    """MuJoCo Warp; the worlds it was last asked for stay on the device.
+
+    Raises:
+        MissingExtraError: warp is not installed.
+    """
+
+    def __init__(self, physics: PhysicsConfig) -> None:
+        from flashdex.envs.physics.warp.model import require_warp
+
+        require_warp()
+        self._physics = physics
+        self._batch: WarpRollout | None = None
+
+    def __call__(
+        self, worlds: Worlds, ctrl: Array, first: int
+    ) -> tuple[Array, Array]:
+        """Play controls; see ``Simulator``."""
+        from flashdex.envs.physics.warp.rollout import WarpRollout
+
+        batch = self._batch
+        if batch is None or not batch.fits(worlds.models, len(ctrl)):
+            self._batch = batch = None  # its memory is free before more is taken
+            batch = WarpRollout(worlds.models, len(ctrl), self._physics)
+            self._batch = batch
+        noise = worlds.noise[:, first : first + ctrl.shape[1]]
+        return batch(worlds.states, ctrl, noise)
+
+
+def make_simulator(engine: SampleEngine, physics: PhysicsConfig) -> Simulator | None:
+    """What tries samples; None is MuJoCo C, which a problem has of its own.
+
+    Raises:
+        MissingExtraError: packages of the engine are not installed.
+    """
+    return Warp(physics) if engine == "warp" else None

@@ -88,8 +88,8 @@ class SearchConfig:
     end_weight: float = number(1.0, low=0, high=1000)
     """Weight added to the last quarter of the horizon."""
     engine: SampleEngine = "cpu"
-    """Who tries the samples: cpu = MuJoCo C; warp = MuJoCo Warp on one NVIDIA GPU, which
-    ``physics=warp`` sets. What is found is played, scored and certified in MuJoCo C."""
+    """Who tries the samples: cpu = MuJoCo C, warp = MuJoCo Warp on one NVIDIA GPU;
+    ``physics=warp`` sets it. What is found is scored and certified in MuJoCo C."""
     samples_factor: int | None = number(None, low=1, high=10_000)
     """Factor of the samples of every rung; null = 1 for cpu, 64 for warp."""
     budget_s: float = number(60.0, above=0, high=1e7)

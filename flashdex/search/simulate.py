@@ -37,9 +37,7 @@ class Worlds:
 class Simulator(Protocol):
     """Plays N sequences of H controls in each of K worlds."""
 
-    def __call__(
-        self, worlds: Worlds, ctrl: Array, first: int
-    ) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
         """Play controls (N, H, nu) from the worlds' states, at control step ``first``.
 
         Returns:
@@ -55,9 +53,7 @@ class MujocoC:
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._data, self._substeps = mujoco.MjData(model), substeps
 
-    def __call__(
-        self, worlds: Worlds, ctrl: Array, first: int
-    ) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
         """Play controls; see ``Simulator``."""
         n, steps = ctrl.shape[:2]
         count, substeps = len(worlds.models), self._substeps
@@ -86,9 +82,7 @@ class Warp:
         self._physics = physics
         self._batch: WarpRollout | None = None
 
-    def __call__(
-        self, worlds: Worlds, ctrl: Array, first: int
-    ) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
         """Play controls; see ``Simulator``."""
         from flashdex.envs.physics.warp.rollout import WarpRollout
 

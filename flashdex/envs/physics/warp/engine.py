@@ -96,7 +96,7 @@ def _kinds(overflow: Any) -> dict[str, int]:
 def count_overflow(flags: Tensor) -> dict[str, int]:
     """Worlds that ran out of room, by kind, of warp's flags (N,), which are cleared."""
     mjw = require_warp()[1]
-    found = flags.cpu()
+    found = flags.clone()
     flags.zero_()
     worlds = {
         kind: int(((found & int(bits)) != 0).sum())

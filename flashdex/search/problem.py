@@ -203,6 +203,10 @@ class Problem:
         play = self._truth if len(actions) == 1 else self._simulator
         states, sensors = play(worlds, ctrl, first)
         self.simulated += states[..., 0].size
+        return self.trial(states, sensors)
+
+    def trial(self, states: Array, sensors: Array) -> Trial:
+        """What a simulator found, (N, K, H, .) each, as objects and fingertips."""
         columns = 1 + self.adr[:, None] + np.arange(7)  # time stands first
         pose = states[..., columns]
         return Trial(pose[..., :3], pose[..., 3:], self._tips(sensors), states)

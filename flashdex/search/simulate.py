@@ -94,6 +94,11 @@ class Warp:
         noise = worlds.noise[:, first : first + ctrl.shape[1]]
         return batch(worlds.states, ctrl, noise)
 
+    @property
+    def overflow(self) -> dict[str, int]:
+        """Worlds on the device that have run out of room, by kind."""
+        return {} if self._batch is None else self._batch.overflow
+
 
 def make_simulator(engine: SampleEngine, physics: PhysicsConfig) -> Simulator | None:
     """What tries samples; None is MuJoCo C, which a problem has of its own.

@@ -103,7 +103,9 @@ def _make_task(recipe: SearchRecipe) -> TrackingTask:
 def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
     run_dir, why = hold.path, "error"
     with reported(run_dir):
-        ledger = task.open_ledger(run_dir, source="search")
+        found = expect_kind(task.recipe, SearchRecipe, where=str(run_dir)).search
+        on_gpu = found.engine == "warp" and torch.cuda.is_available()
+        ledger = task.open_ledger(run_dir, source="search", on_gpu=on_gpu)
         lines = read_ledger(ledger.path)
         done = lines[-1]["env_steps"] if lines else 0
         start = begin_session(run_dir, env_steps=done, wall_s=0.0, overrides=overrides)
@@ -307,6 +309,9 @@ class _Worker:
         self.layout = SceneLayout.of(self.builder.library)
         self.limits = ErrorLimits.of(recipe.train.criterion)
         self.simulator = make_simulator(recipe.search.engine, recipe.physics)
+        # one that waits for its device spends time as well
+        waits = self.simulator is not None
+        self.clock = time.perf_counter if waits else time.process_time
         self.provenance = provenance
         self.problem = lru_cache(KEPT)(self._problem)
 
@@ -328,7 +333,7 @@ class _Worker:
 
     def work(self, order: _Order) -> _Found:
         """Plan one motion by one rung, score it, and certify what passes."""
-        begun, search = time.process_time(), self.recipe.search
+        begun, search = self.clock(), self.recipe.search
         problem = self.problem(order.row)
         before = problem.simulated
         plan = Planner(
@@ -358,7 +363,7 @@ class _Worker:
         if summary["converted"] and self.recipe.train.certify:
             rollout.errors = json.dumps(summary["errors"])
             certificate = certify(rollout, model=problem.scene.model)
-        spent = time.process_time() - begun
+        spent = self.clock() - begun
         return _Found(order, rollout, certificate, spent, problem.simulated - before)
 
 
@@ -367,7 +372,8 @@ _worker: list[_Worker] = []  # of this process
 
 def _open_worker(recipe: SearchRecipe, provenance: dict[str, str]) -> None:
     live_with_parent()
-    torch.set_num_threads(1)
+    if recipe.search.engine == "cpu":  # a process a core
+        torch.set_num_threads(1)
     _worker.append(_Worker(recipe, provenance))
 
 

@@ -59,7 +59,7 @@ class WarpRollout:
         self._warmstart = wp.to_torch(data.qacc_warmstart)
         self._overflow = wp.to_torch(data.overflow)
         self._step = Recorded(self._launch, self.device)
-        self._told = False
+        self.overflow: dict[str, int] = {}  # worlds that ran out of room last, by kind
 
     def fits(self, models: list[mujoco.MjModel], count: int) -> bool:
         """Whether these are the worlds of so many sequences in those models."""
@@ -145,22 +145,21 @@ class WarpRollout:
             x.reshape(steps, n, count, -1).permute(1, 2, 0, 3).cpu().numpy()
             for x in (found, sensors)
         )
-        self._tell_overflow()
+        self._look_for_overflow()
         return states, sensed
 
-    def _tell_overflow(self) -> None:
-        """Warn once where the engine dropped contacts: those samples were wrong."""
+    def _look_for_overflow(self) -> None:
+        """Warn, once, where the engine dropped contacts: those samples were wrong."""
         found = count_overflow(self._overflow)
-        if found and not self._told:
-            self._told = True
-            worlds = self._count * len(self._models)
+        if found and not self.overflow:
             _log.warning(
                 "samples in MuJoCo Warp: of %d worlds some ran out of room (%s), so "
                 "they lacked contacts; what is found is scored in MuJoCo C all the "
                 "same. Raise physics.nconmax and physics.njmax",
-                worlds,
+                self._count * len(self._models),
                 ", ".join(f"{kind} {count}" for kind, count in found.items()),
             )
+        self.overflow = found or self.overflow
 
 
 def _rows(models: list[mujoco.MjModel]) -> dict[str, np.ndarray]:

@@ -30,7 +30,8 @@ COLUMNS = {
     "replay": "replay rows stored_bytes_per_row written_rows_per_s "
     "sampled_rows_per_s assembled_rows_per_s share_of_gather",
     "search": "engine samples worlds horizon hulls samples_per_s "
-    "rollout_samples_per_s cpu_samples_per_s ratio gap_mm overflow memory_gb.device_used",
+    "rollout_samples_per_s cpu_samples_per_s ratio gap_mm overflow "
+    "memory_gb.device_used",
     "growth": "engine num_envs objects hulls relative_physics relative_env ratio",
     "curve": "hours env_steps perf/env_steps_per_s convert/cumulative "
     "convert/certified",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import mujoco
 import numpy as np
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
+Played = tuple[NDArray[Any], NDArray[Any]]  # in the engine's own precision
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Worlds:
 class Simulator(Protocol):
     """Plays N sequences of H controls in each of K worlds."""
 
-    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> Played:
         """Play controls (N, H, nu) from the worlds' states, at control step ``first``.
 
         Returns:
@@ -53,7 +54,7 @@ class MujocoC:
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._data, self._substeps = mujoco.MjData(model), substeps
 
-    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> Played:
         """Play controls; see ``Simulator``."""
         n, steps = ctrl.shape[:2]
         count, substeps = len(worlds.models), self._substeps
@@ -82,7 +83,7 @@ class Warp:
         self._physics = physics
         self._batch: WarpRollout | None = None
 
-    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> tuple[Array, Array]:
+    def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> Played:
         """Play controls; see ``Simulator``."""
         from flashdex.envs.physics.warp.rollout import WarpRollout
 

@@ -1,6 +1,8 @@
 """Samples in MuJoCo Warp, on the CPU: where MuJoCo C says that the worlds go."""
 
 import dataclasses
+import gc
+import weakref
 
 import mujoco
 import numpy as np
@@ -78,6 +80,20 @@ def test_a_recorded_step_gives_what_a_launched_one_gives(make_problem):
         np.testing.assert_array_equal(a, b)
 
 
+def test_worlds_are_gone_when_others_are_asked_for(make_problem):
+    """At once, not when the collector comes by: a device has no room for both."""
+    problem, warp = make_problem("right_box"), Warp(PhysicsConfig())
+    worlds, ctrl = problem.worlds(1), draw_controls(problem, count=3)[:, :1]
+    warp(worlds, ctrl, 0)
+    before = weakref.ref(warp._batch)
+    gc.disable()
+    try:
+        warp(worlds, ctrl[:2], 0)
+    finally:
+        gc.enable()
+    assert before() is None
+
+
 def test_one_sequence_is_carried_out_in_mujoco_c(make_problem):
     """Whatever tries the samples: plans stand on the states that are judged."""
 
@@ -106,6 +122,7 @@ def test_room_that_runs_out_is_said_once(make_problem, caplog):
     worlds, ctrl = problem.worlds(1), draw_controls(problem)
     for _ in range(2):
         warp(worlds, ctrl, 0)
+    assert warp.overflow
     (told,) = [r.getMessage() for r in caplog.records if "ran out" in r.getMessage()]
     assert "physics.nconmax" in told
 

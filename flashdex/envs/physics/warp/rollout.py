@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-Array = NDArray[np.floating]
+Array = NDArray[Any]
 
 
 class WarpRollout:
@@ -58,7 +59,9 @@ class WarpRollout:
         self._ctrl, self._sensor = wp.to_torch(data.ctrl), wp.to_torch(data.sensordata)
         self._warmstart = wp.to_torch(data.qacc_warmstart)
         self._overflow = wp.to_torch(data.overflow)
-        self._step = Recorded(self._launch, self.device)
+        # of model and data alone: with a circle here memory would be free too late
+        launch = partial(_launch, self._model, self._data, self._decimation)
+        self._step = Recorded(launch, self.device)
         self.overflow: dict[str, int] = {}  # worlds that ran out of room last, by kind
 
     def fits(self, models: list[mujoco.MjModel], count: int) -> bool:
@@ -99,11 +102,6 @@ class WarpRollout:
             view = wp.to_torch(getattr(model, name))
             view.copy_(torch.from_numpy(values).reshape(view.shape))
         return model, data
-
-    def _launch(self) -> None:
-        step = require_warp()[1].step
-        for _ in range(self._decimation):
-            step(self._model, self._data)
 
     def _spread(self, rows: Array) -> Tensor:
         """Rows of the variants (K, .) for all worlds, (N K, .)."""
@@ -162,6 +160,12 @@ class WarpRollout:
         self.overflow = found or self.overflow
 
 
+def _launch(model: Any, data: Any, substeps: int) -> None:
+    step = require_warp()[1].step
+    for _ in range(substeps):
+        step(model, data)
+
+
 def _rows(models: list[mujoco.MjModel]) -> dict[str, np.ndarray]:
     """Fields of which the variants have different numbers, (K, ...).
 
@@ -170,9 +174,7 @@ def _rows(models: list[mujoco.MjModel]) -> dict[str, np.ndarray]:
     """
     out = {}
     for name, is_per_world in model_fields().items():
-        values = [getattr(model, name, None) for model in models]
-        if not isinstance(values[0], np.ndarray):
-            continue
+        values = [getattr(model, name) for model in models if hasattr(model, name)]
         if all(np.array_equal(value, values[0]) for value in values):
             continue
         if not is_per_world:

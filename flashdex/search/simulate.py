@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from flashdex.envs.physics.config import PhysicsConfig
     from flashdex.envs.physics.warp.rollout import WarpRollout
 
+_LOG = logging.getLogger(__name__)
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 Array = NDArray[np.float64]
@@ -82,18 +85,36 @@ class Warp:
         require_warp()
         self._physics = physics
         self._batch: WarpRollout | None = None
+        self._most = sys.maxsize  # worlds that there is room for
 
     def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> Played:
-        """Play controls; see ``Simulator``."""
-        from flashdex.envs.physics.warp.rollout import WarpRollout
-
-        batch = self._batch
-        if batch is None or not batch.fits(worlds.models, len(ctrl)):
-            self._batch = batch = None  # its memory is free before more is taken
-            batch = WarpRollout(worlds.models, len(ctrl), self._physics)
-            self._batch = batch
+        """Play controls, as many sequences at a time as fit; see ``Simulator``."""
+        batch = self._batch_for(worlds.models, len(ctrl))
         noise = worlds.noise[:, first : first + ctrl.shape[1]]
-        return batch(worlds.states, ctrl, noise)
+        starts = range(0, len(ctrl), batch.count)
+        parts = [ctrl[i : i + batch.count] for i in starts]
+        short = batch.count - len(parts[-1])
+        parts[-1] = np.pad(parts[-1], ((0, short), (0, 0), (0, 0)), mode="edge")
+        played = [batch(worlds.states, part, noise) for part in parts]
+        states, sensors = (np.concatenate(found) for found in zip(*played, strict=True))
+        return states[: len(ctrl)], sensors[: len(ctrl)]
+
+    def _batch_for(self, models: list[mujoco.MjModel], count: int) -> WarpRollout:
+        from flashdex.envs.physics.warp.rollout import NoRoomError, WarpRollout
+
+        while True:
+            size = max(1, min(count, self._most // len(models)))
+            batch = self._batch
+            if batch is not None and batch.models is models and batch.count == size:
+                return batch
+            self._batch = batch = None  # its memory is free before more is taken
+            try:
+                self._batch = WarpRollout(models, size, self._physics)
+            except NoRoomError as error:
+                if size == 1:
+                    raise
+                self._most = size * len(models) // 2
+                _LOG.warning("%s; %d at a time", error, self._most)
 
     @property
     def overflow(self) -> dict[str, int]:

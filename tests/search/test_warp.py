@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flashdex.envs.physics.config import PhysicsConfig
+from flashdex.envs.physics.warp.rollout import WarpRollout
 from flashdex.errors import FlashdexError
 from flashdex.search.config import Rung, SearchConfig
 from flashdex.search.simulate import Warp, Worlds
@@ -125,6 +126,31 @@ def test_room_that_runs_out_is_said_once(make_problem, caplog):
     assert warp.overflow
     (told,) = [r.getMessage() for r in caplog.records if "ran out" in r.getMessage()]
     assert "physics.nconmax" in told
+
+
+def test_samples_that_do_not_fit_are_played_in_turn(make_problem, warp, monkeypatch):
+    problem = make_problem("right_box")
+    worlds, ctrl = problem.worlds(2), draw_controls(problem, count=5)[:, :2]
+    wanted = warp(worlds, ctrl, 0)
+    put = WarpRollout._put
+
+    def scarce(self, physics):
+        if self.count * len(self.models) > 4:
+            raise RuntimeError("Failed to allocate")
+        return put(self, physics)
+
+    monkeypatch.setattr(WarpRollout, "_put", scarce)
+    few = Warp(PhysicsConfig())
+    for a, b in zip(few(worlds, ctrl, 0), wanted, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4, rtol=1e-4)
+    assert few._batch.count == 2
+    monkeypatch.setattr(WarpRollout, "_put", nothing_fits)
+    with pytest.raises(FlashdexError, match="do not fit"):
+        Warp(PhysicsConfig())(worlds, ctrl, 0)
+
+
+def nothing_fits(*_):
+    raise RuntimeError("Failed to allocate")
 
 
 def test_a_gpu_gets_more_samples():

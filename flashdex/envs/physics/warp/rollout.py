@@ -30,6 +30,10 @@ _log = logging.getLogger(__name__)
 Array = NDArray[Any]
 
 
+class NoRoomError(FlashdexError):
+    """Worlds that the device has no memory for."""
+
+
 class WarpRollout:
     """N sequences in each of K variants of a scene, N x K worlds on the device.
 
@@ -42,31 +46,36 @@ class WarpRollout:
         physics: decimation, and the room for contacts.
 
     Raises:
-        FlashdexError: the variants differ in something else, or do not fit in memory.
+        NoRoomError: they do not fit in the device's memory.
+        FlashdexError: the variants differ in something else.
     """
 
     def __init__(
         self, models: list[mujoco.MjModel], count: int, physics: PhysicsConfig
     ) -> None:
         wp, _ = require_warp()
-        self._models, self._count = models, count
+        self.models, self.count = models, count
         self._decimation = physics.decimation
         self.device = warp_device()
         self._name = str(wp.device_from_torch(self.device))
-        self._model, self._data = self._put(physics)
+        try:
+            self._model, self._data = self._put(physics)
+            # of model and data alone: in a circle they would be free too late
+            launch = partial(_launch, self._model, self._data, self._decimation)
+            self._step = Recorded(launch, self.device)
+            self._step()  # asks for the memory of a step
+        except (RuntimeError, MemoryError) as error:
+            raise NoRoomError(
+                f"physics=warp: {count * len(models)} worlds do not fit on "
+                f"{self._name} ({error})"
+            ) from None
         data = self._data
         self._qpos, self._qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self._ctrl, self._sensor = wp.to_torch(data.ctrl), wp.to_torch(data.sensordata)
         self._warmstart = wp.to_torch(data.qacc_warmstart)
         self._overflow = wp.to_torch(data.overflow)
-        # of model and data alone: with a circle here memory would be free too late
-        launch = partial(_launch, self._model, self._data, self._decimation)
-        self._step = Recorded(launch, self.device)
+        self._overflow.zero_()  # of that first step
         self.overflow: dict[str, int] = {}  # worlds that ran out of room last, by kind
-
-    def fits(self, models: list[mujoco.MjModel], count: int) -> bool:
-        """Whether these are the worlds of so many sequences in those models."""
-        return models is self._models and count == self._count
 
     def _put(self, physics: PhysicsConfig) -> tuple[Any, Any]:
         """Model and data on the device; what differs between variants has K rows.
@@ -75,27 +84,21 @@ class WarpRollout:
         so inverse weights and the like follow from each variant's masses.
         """
         wp, mjw = require_warp()
-        rows, worlds = _rows(self._models), self._count * len(self._models)
-        host = copy.copy(self._models[0])
+        rows, worlds = _rows(self.models), self.count * len(self.models)
+        host = copy.copy(self.models[0])
         # mujoco_warp never resets a world that diverges, and has no such flag.
         host.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         room = room_of(host, physics)
-        try:
-            with wp.ScopedDevice(self._name):
-                model = mjw.put_model(host, batch_sizes=_lengths(rows))
-                data = mjw.make_data(
-                    host,
-                    nworld=worlds,
-                    nconmax=room.contacts,
-                    nccdmax=room.convex,
-                    njmax=room.rows,
-                )
-        except (RuntimeError, MemoryError) as error:
-            raise FlashdexError(
-                f"physics=warp: {worlds} worlds ({self._count} samples in "
-                f"{len(self._models)}) do not fit on {self._name}: {error}. Lower "
-                "search.samples_factor, or physics.nconmax and physics.njmax."
-            ) from None
+        with wp.ScopedDevice(self._name):
+            lengths = {name: len(values) for name, values in rows.items()}
+            model = mjw.put_model(host, batch_sizes=lengths)
+            data = mjw.make_data(
+                host,
+                nworld=worlds,
+                nconmax=room.contacts,
+                nccdmax=room.convex,
+                njmax=room.rows,
+            )
         model.opt.warn_overflow = 0  # told below
         wp.synchronize_device(self._name)  # from here on torch writes on its own stream
         for name, values in rows.items():
@@ -106,7 +109,7 @@ class WarpRollout:
     def _spread(self, rows: Array) -> Tensor:
         """Rows of the variants (K, .) for all worlds, (N K, .)."""
         found = torch.from_numpy(rows).to(self.device, torch.float32)
-        return found.repeat(self._count, *[1] * (found.ndim - 1))
+        return found.repeat(self.count, *[1] * (found.ndim - 1))
 
     def __call__(self, states: Array, ctrl: Array, noise: Array) -> tuple[Array, Array]:
         """Play controls from the variants' states, float32.
@@ -130,7 +133,7 @@ class WarpRollout:
         given = given.repeat_interleave(count, 0) + self._spread(noise)
         found = start.new_empty(steps, n * count, 1 + nq + nv)
         sensors = start.new_empty(steps, *self._sensor.shape)
-        dt = self._decimation * self._models[0].opt.timestep
+        dt = self._decimation * self.models[0].opt.timestep
         elapsed = dt * torch.arange(1, steps + 1, device=self.device)
         found[..., 0] = start[:, 0] + elapsed[:, None]
         for t in range(steps):
@@ -154,7 +157,7 @@ class WarpRollout:
                 "samples in MuJoCo Warp: of %d worlds some ran out of room (%s), so "
                 "they lacked contacts; what is found is scored in MuJoCo C all the "
                 "same. Raise physics.nconmax and physics.njmax",
-                self._count * len(self._models),
+                self.count * len(self.models),
                 ", ".join(f"{kind} {count}" for kind, count in found.items()),
             )
         self.overflow = found or self.overflow
@@ -184,7 +187,3 @@ def _rows(models: list[mujoco.MjModel]) -> dict[str, np.ndarray]:
             )
         out[name] = np.stack([np.array(value) for value in values])
     return out
-
-
-def _lengths(rows: dict[str, np.ndarray]) -> dict[str, int]:
-    return {name: len(values) for name, values in rows.items()}

@@ -138,7 +138,19 @@ def _curve(choice: Choice) -> Iterator[Job]:
     yield Job("curve", words, 60 * choice.minutes, run / "metrics.jsonl")
 
 
-_MAKERS = (_env, _train, _learner, _replay, _curve)
+def _search(choice: Choice) -> Iterator[Job]:
+    sizes = [(8, 1), (8, 2)] if choice.tiny else [(4096, 1), (1024, 4), (1024, 1)]
+    if not choice.tiny:
+        sizes += [(16384, 1), (4096, 4)]
+    words = ["--seconds", "0.5" if choice.tiny else "8"]
+    words += ["--horizon", "4" if choice.tiny else "36", f"physics={choice.engine}"]
+    for samples, worlds in sizes:
+        size = ["--samples", str(samples), "--worlds", str(worlds)]
+        command = ["benchmarks.search", *choice.scene(2, 16), *size, *words]
+        yield Job(f"search n{samples} w{worlds}", [*command, *choice.overrides], 180)
+
+
+_MAKERS = (_env, _train, _learner, _replay, _search, _curve)
 PARTS = {make.__name__.removeprefix("_"): make for make in _MAKERS}
 
 
@@ -170,7 +182,13 @@ class Lines:
 
 def _brief(found: dict[str, Any]) -> str:
     names = ("failed", "env_steps_per_s", "updates_per_s", "sampled_rows_per_s")
-    names += ("ratio", "ratio_to_baseline", "convert/cumulative", "env_steps")
+    names += (
+        "samples_per_s",
+        "ratio",
+        "ratio_to_baseline",
+        "convert/cumulative",
+        "env_steps",
+    )
     return ", ".join(f"{k} {found[k]}" for k in names if k in found)
 
 

@@ -29,6 +29,9 @@ COLUMNS = {
     "share_of_ceiling_compiled_autocast",
     "replay": "replay rows stored_bytes_per_row written_rows_per_s "
     "sampled_rows_per_s assembled_rows_per_s share_of_gather",
+    "search": "engine samples worlds horizon hulls samples_per_s "
+    "rollout_samples_per_s cpu_samples_per_s ratio gap_mm overflow "
+    "memory_gb.device_used",
     "growth": "engine num_envs objects hulls relative_physics relative_env ratio",
     "curve": "hours env_steps perf/env_steps_per_s convert/cumulative "
     "convert/certified",
@@ -60,6 +63,9 @@ HEADINGS = {
     "sampled_rows_per_s": "sampled/s",
     "assembled_rows_per_s": "assembled/s",
     "share_of_gather": "of a plain gather",
+    "samples_per_s": "samples/s",
+    "rollout_samples_per_s": "rollouts alone",
+    "cpu_samples_per_s": "MuJoCo C, one core",
     "relative_physics": "physics, a world's step",
     "relative_env": "environment, a world's step",
     "env_steps": "env steps",

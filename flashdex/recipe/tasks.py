@@ -229,9 +229,13 @@ class SearchRecipe(Recipe):
         """The recipe whose environment has the bounds of the search as its actions.
 
         So that stored actions mean what they mean in every run: residuals on targets
-        that lead the servos.
+        that lead the servos. An engine that is only there for samples moves to
+        ``search.engine``: states, scores and certificates are MuJoCo C's.
         """
-        found, env = self.search, self.env
+        found, env, physics = self.search, self.env, self.physics
+        if physics.engine == "warp":
+            found = dataclasses.replace(found, engine="warp")
+            physics = dataclasses.replace(physics, engine="cpu")
         env = dataclasses.replace(
             env,
             finger_mode="residual",
@@ -241,7 +245,7 @@ class SearchRecipe(Recipe):
             wrist_lowpass_hz=0.0,
             feedforward="inverse",
         )
-        return dataclasses.replace(self, env=env)
+        return dataclasses.replace(self, env=env, physics=physics, search=found)
 
 
 def find_search_conflicts(recipe: SearchRecipe) -> list[str]:
@@ -252,10 +256,16 @@ def find_search_conflicts(recipe: SearchRecipe) -> list[str]:
 
 def _ladders(recipe: SearchRecipe) -> list[str]:
     found, problems = recipe.search, []
-    if recipe.physics.engine != "cpu":
+    if recipe.physics.engine == "brax":
         problems.append(
-            f"physics.engine: the search steps MuJoCo C; '{recipe.physics.engine}' is "
-            "not available, use physics=cpu"
+            "physics.engine: the search tries samples in MuJoCo C or MuJoCo Warp, not "
+            "in 'brax'; use physics=cpu or physics=warp"
+        )
+    on_device = "warp" in (recipe.physics.engine, found.engine)
+    if on_device and found.workers > 1:
+        problems.append(
+            f"search.workers: {found.workers} processes would share one GPU; with "
+            "warp leave it out, one process tries all samples"
         )
     for name in ("ladder", "robust_ladder"):
         for i, rung in enumerate(getattr(found, name)):

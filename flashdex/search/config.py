@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 from flashdex.system.fields import number
+
+SampleEngine = Literal["cpu", "warp"]
+# A GPU steps its worlds side by side: a rung should fill it. Not tuned on one yet.
+SAMPLES_FACTOR: dict[SampleEngine, int] = {"cpu": 1, "warp": 64}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +95,13 @@ class SearchConfig:
     """Cost of changes between knots, in standard deviations squared."""
     end_weight: float = number(1.0, low=0, high=1000)
     """Weight added to the last quarter of the horizon."""
+    engine: SampleEngine = "cpu"
+    """Who tries the samples: cpu = MuJoCo C, warp = MuJoCo Warp on one NVIDIA GPU;
+    ``physics=warp`` sets it. What is found is scored and certified in MuJoCo C."""
+    samples_factor: int | None = number(None, low=1, high=10_000)
+    """Factor of the samples of every rung; null = 1 for cpu, 64 for warp."""
     budget_s: float = number(60.0, above=0, high=1e7)
-    """Core-seconds of a motion until a plan passes; a pass that has begun is finished."""
+    """Core-seconds of a motion until a plan passes; one begun is finished."""
     robust_budget_s: float = number(90.0, low=0, high=1e7)
     """Core-seconds from there on, until a plan survives perturbations."""
     workers: int = number(0, low=0, high=1024)
@@ -101,3 +111,18 @@ class SearchConfig:
     robust_ladder: list[Rung] = dataclasses.field(default_factory=_robust_ladder)
     """Those tried then, in several worlds, until a plan survives perturbations, too;
     empty = one that passes is enough."""
+
+    @property
+    def rungs(self) -> list[Rung]:
+        """The rung of each pass: of both ladders in turn, with the samples drawn."""
+        factor = self.samples_factor or SAMPLES_FACTOR[self.engine]
+        return [
+            dataclasses.replace(rung, samples=rung.samples * factor)
+            for rung in (*self.ladder, *self.robust_ladder)
+            for _ in range(rung.tries)
+        ]
+
+    @property
+    def num_plain(self) -> int:
+        """How many of them are not of the robust ladder."""
+        return sum(rung.tries for rung in self.ladder)

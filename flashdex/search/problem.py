@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from mujoco import rollout
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -27,29 +26,12 @@ from flashdex.envs.scene.perturbation import (
 from flashdex.envs.scene.scene import Scene
 from flashdex.hands.gains import NUM_WRIST_JOINTS
 from flashdex.hands.spec import HandSpec
+from flashdex.search.simulate import FULL, MujocoC, Simulator, Worlds
 
-FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 TOUCH = 0.01  # m; nearer than this a recorded fingertip belongs on the object
 _DRAWS = 9173  # of the perturbed worlds; the certificate draws others
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Worlds:
-    """Where sequences of actions are tried: the nominal world first, K in all."""
-
-    models: list[mujoco.MjModel]
-    states: Array  # full physics states, (K, .)
-    noise: Array  # added to the controls of the whole motion, (K, S, nu)
-
-    def after(self, states: Array) -> Worlds:
-        """The same worlds in other states, (K, .)."""
-        return Worlds(self.models, states, self.noise)
-
-    def only(self, which: slice) -> Worlds:
-        """Some of the worlds."""
-        return Worlds(self.models[which], self.states[which], self.noise[which])
 
 
 @dataclass(frozen=True)
@@ -76,6 +58,7 @@ class Problem:
         row: of the motion.
         env: scales of the actions, which are residuals; the wrist's not filtered.
         decimation: physics steps a control step.
+        simulator: tries samples; None is MuJoCo C.
     """
 
     def __init__(
@@ -88,6 +71,7 @@ class Problem:
         *,
         env: EnvConfig,
         decimation: int,
+        simulator: Simulator | None = None,
     ) -> None:
         self.hands, self.scene, self.row = hands, scene, row
         self._map, self._env, self._decimation = states, env, decimation
@@ -113,7 +97,8 @@ class Problem:
         qpos, qvel, _ = states.write(rows[:1], **start)
         self.qpos0, self.qvel0 = qpos[0].numpy(), qvel[0].numpy()
         self.model = self._planning_model()
-        self._data = mujoco.MjData(self.model)
+        self._truth = MujocoC(self.model, decimation)
+        self._simulator = simulator or self._truth
         self.ref_tips = self._reference_tips(ref["joint_pos"])
         self.simulated = 0  # control steps so far
 
@@ -228,20 +213,18 @@ class Problem:
     def simulate(
         self, worlds: Worlds, actions: NDArray[np.float32], first: int = 0
     ) -> Trial:
-        """Try actions (N, H, 2, J) in all worlds, from their states at ``first`` on."""
-        n, steps = actions.shape[:2]
-        count, substeps = len(worlds.models), self._decimation
-        ctrl = self.controls(actions, first)[:, None]
-        ctrl = ctrl + worlds.noise[None, :, first : first + steps]
-        ctrl = np.repeat(ctrl.reshape(n * count, steps, -1), substeps, axis=1)
-        models = worlds.models[0] if count == 1 else worlds.models * n
-        start = np.tile(worlds.states, (n, 1))
-        states, sensors = rollout.rollout(models, self._data, start, ctrl)
-        self.simulated += n * count * steps
-        states, sensors = (
-            x[:, substeps - 1 :: substeps].reshape(n, count, steps, x.shape[-1])
-            for x in (states, sensors)
-        )
+        """Try actions (N, H, 2, J) in all worlds, from their states at ``first`` on.
+
+        A single sequence is not tried but carried out: MuJoCo C plays it in any case.
+        """
+        ctrl = self.controls(actions, first)
+        play = self._truth if len(actions) == 1 else self._simulator
+        states, sensors = play(worlds, ctrl, first)
+        self.simulated += states[..., 0].size
+        return self.trial(states, sensors)
+
+    def trial(self, states: Array, sensors: Array) -> Trial:
+        """What a simulator found, (N, K, H, .) each, as objects and fingertips."""
         columns = 1 + self.adr[:, None] + np.arange(7)  # time stands first
         pose = states[..., columns]
         return Trial(pose[..., :3], pose[..., 3:], self._tips(sensors), states)

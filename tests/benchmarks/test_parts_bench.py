@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import replay, train
+from benchmarks import replay, search, train
 from benchmarks.common import output, turns
 from benchmarks.common.ceilings import gather_seconds, matmul_ceilings, seconds_each
 from flashdex.errors import FlashdexError
@@ -135,3 +135,15 @@ def test_ceilings_are_of_the_stated_work():
     few = gather_seconds(20_000, 800, 16, **options)
     many = gather_seconds(20_000, 800, 16_000, **options)
     assert many > 10 * few
+
+
+def test_a_round_of_the_search_is_timed_beside_mujoco_c(library, capsys):
+    words = ["--samples", "4", "--worlds", "2", "--horizon", "3", "--seconds", "0.01"]
+    found = search.main([*words, f"motions.library={library.path}"])
+    assert json.loads(capsys.readouterr().out) == found
+    assert (found["engine"], found["horizon"]) == ("cpu", 3)
+    assert found["gap_mm"] == 0
+    assert found["samples_per_s"] < found["rollout_samples_per_s"]
+    assert found["ratio"] > 0
+    assert set(found["ms_by_part"]) == {"controls", "rollout", "cost"}
+    assert found["overflow"] == {}

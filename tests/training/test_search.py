@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import sys
 from hashlib import sha256
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from flashdex.search.config import Rung, SearchConfig
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.run_files import read_metrics, read_sessions
 from flashdex.training.loaded import verify
-from flashdex.training.run_dir import train
+from flashdex.training.run_dir import load_run_recipe, train
 from flashdex.training.tasks import search as searching
 from flashdex.training.tasks.search import resume_search, search
 
@@ -138,11 +139,13 @@ def test_workers_search_in_processes_of_their_own(recipe):
 
 
 def test_the_command_composes_a_recipe_for_the_search(capsys):
-    words = ["search", "quickstart", "search.ladder=[]", "physics=warp"]
+    words = ["search", "quickstart", "search.ladder=[]", "physics=brax"]
     assert main(words) == 2
     told = capsys.readouterr().err
     assert "search.ladder: empty" in told
     assert "physics.engine" in told
+    assert main(["search", "quickstart", "physics=warp", "search.workers=2"]) == 2
+    assert "search.workers" in capsys.readouterr().err
     assert main(["train", "quickstart", "search.stride=4"]) == 2
     assert "task: search" in capsys.readouterr().err
 
@@ -218,3 +221,34 @@ def test_a_run_of_other_things_is_no_source(left, capsys):
         search(recipe, source=source)
     assert not Path(recipe.run_dir).exists()
     assert main(["search", "x", "--from", str(source), "--resume", str(source)]) == 2
+
+
+@pytest.mark.slow
+def test_samples_of_warp_become_conversions_of_mujoco_c(recipe, inline):
+    """The same controls give the stored states on the cpu engine; a resume goes on."""
+    pytest.importorskip("mujoco_warp")
+    few = dataclasses.replace(LADDERS, samples_factor=1, robust_ladder=[], workers=0)
+    recipe = dataclasses.replace(
+        only(recipe, "right_box"),
+        physics=PhysicsConfig(engine="warp", num_threads=1),
+        search=few,
+    )
+    run = search(recipe)
+    (line,) = read_ledger(run / CONVERSIONS)
+    assert line["engine"] == "cpu"
+    assert line["certified"]
+    kept = load_run_recipe(run)
+    assert (kept.physics.engine, kept.search.engine) == ("cpu", "warp")
+    assert verify(run).holds
+    assert resume_search(run) == run
+    assert len(read_ledger(run / CONVERSIONS)) == 1
+
+
+def test_warp_that_is_not_installed_is_said_before_anything_is_written(
+    recipe, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    config = dataclasses.replace(LADDERS, engine="warp")
+    with pytest.raises(FlashdexError, match="'warp'"):
+        search(dataclasses.replace(recipe, search=config))
+    assert not Path(recipe.run_dir).exists()

@@ -30,10 +30,11 @@ from flashdex.rollouts.ledger import Ledger, read_ledger
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import MAX_FILE, OF_SEARCH, Rollout
 from flashdex.rollouts.scorer import live_with_parent
-from flashdex.search.config import Rung, SearchConfig
+from flashdex.search.config import SearchConfig
 from flashdex.search.costs import ErrorLimits, shares
 from flashdex.search.plan import Planner
 from flashdex.search.problem import Problem, Trial
+from flashdex.search.simulate import make_simulator
 from flashdex.system.arrays import hash_content
 from flashdex.system.children import spawning_pool
 from flashdex.system.files import RunHold, own_file
@@ -89,8 +90,7 @@ def search(
     run_dir = Path(recipe.run_dir or named)
     refuse_old_run(run_dir)
     check_writers(recipe)
-    with interruptible():
-        task = TrackingTask(RunBuilder.from_recipe(recipe))
+    task = _make_task(recipe)
     prepare = forget_source
     if source is not None:
         found = read_source(source, recipe, task.contents)
@@ -109,17 +109,24 @@ def resume_search(run: str | Path) -> Path:
     recipe = expect_kind(load_run_recipe(run_dir), SearchRecipe, where=str(run_dir))
     check_writers(recipe)
     with resumed_run(run_dir) as hold:
-        with interruptible():
-            task = TrackingTask(RunBuilder.from_recipe(recipe))
+        task = _make_task(recipe)
         task.check_inputs(run_dir)
         return _run(task, hold, [])
+
+
+def _make_task(recipe: SearchRecipe) -> TrackingTask:
+    make_simulator(recipe.search.engine, recipe.physics)  # here it says what is missing
+    with interruptible():
+        return TrackingTask(RunBuilder.from_recipe(recipe))
 
 
 def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
     run_dir, why = hold.path, "error"
     source = Source.read(run_dir)
     with reported(run_dir):
-        ledger = task.open_ledger(run_dir, source="search")
+        found = expect_kind(task.recipe, SearchRecipe, where=str(run_dir)).search
+        on_gpu = found.engine == "warp" and torch.cuda.is_available()
+        ledger = task.open_ledger(run_dir, source="search", on_gpu=on_gpu)
         lines = read_ledger(ledger.path)
         done = lines[-1]["env_steps"] if lines else 0
         start = begin_session(run_dir, env_steps=done, wall_s=0.0, overrides=overrides)
@@ -134,11 +141,6 @@ def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
             end_session(run_dir, why, **counters)
     _LOG.info("ended after %.0f core-seconds: %s", session.core_s, why)
     return run_dir
-
-
-def every_pass(ladder: list[Rung]) -> list[Rung]:
-    """The rung of each pass, one after the other."""
-    return [rung for rung in ladder for _ in range(rung.tries)]
 
 
 @dataclass
@@ -191,8 +193,7 @@ class _Session:
     def __post_init__(self) -> None:
         self.recipe = expect_kind(self.task.recipe, SearchRecipe, where="search")
         self.search: SearchConfig = self.recipe.search
-        self.first_robust = len(every_pass(self.search.ladder))
-        self.num_passes = self.first_robust + len(every_pass(self.search.robust_ladder))
+        self.rungs = self.search.rungs
         self.names = self.task.builder.bank.names
         self.motions = {name: _Progress() for name in self.names}
         for name in self.source.starts.keys() & self.motions.keys():
@@ -215,7 +216,7 @@ class _Session:
         one.miss = min(one.miss, distance)
         one.core_s += spent
         self.core_s += spent
-        if rung >= self.first_robust:
+        if rung >= self.search.num_plain:
             one.robust_s += spent
         self.env_steps = max(self.env_steps, line["env_steps"])
 
@@ -227,10 +228,10 @@ class _Session:
             if name in self.source.converted or name in busy:
                 continue
             if before is None or is_unmoved(before):
-                rung, last = one.rung + 1, self.first_robust
+                rung, last = one.rung + 1, self.search.num_plain
                 near, spent = one.miss, one.core_s >= self.search.budget_s
             else:
-                rung, last = max(one.rung + 1, self.first_robust), self.num_passes
+                rung, last = max(one.rung + 1, self.search.num_plain), len(self.rungs)
                 near = (False, False, -(before.get("survived") or 0.0))
                 spent = one.robust_s >= self.search.robust_budget_s
                 spent = spent or before.get("verdict") == "robust"
@@ -269,6 +270,8 @@ class _Session:
     def run(self) -> str:
         """Search until nothing is left to try, or something ends it; return why."""
         count = self.search.workers or len(os.sched_getaffinity(0))
+        if self.search.engine == "warp":  # its worlds fill the device
+            count = 1
         count = max(1, min(count, len(self.names)))
         progress = Progress(
             self.recipe.name,
@@ -355,6 +358,10 @@ class _Worker:
         self.builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
         self.layout = SceneLayout.of(self.builder.library)
         self.limits = ErrorLimits.of(recipe.train.criterion)
+        self.simulator = make_simulator(recipe.search.engine, recipe.physics)
+        # one that waits for its device spends time as well
+        waits = self.simulator is not None
+        self.clock = time.perf_counter if waits else time.process_time
         self.provenance = provenance
         self.problem = lru_cache(KEPT)(self._problem)
 
@@ -371,6 +378,7 @@ class _Worker:
             row,
             env=recipe.env,
             decimation=recipe.physics.decimation,
+            simulator=self.simulator,
         )
 
     def _start(self, order: _Order, problem: Problem) -> NDArray[np.float32] | None:
@@ -392,14 +400,13 @@ class _Worker:
 
     def work(self, order: _Order) -> _Found:
         """Plan one motion by one rung, score it, and certify what passes."""
-        begun, search = time.process_time(), self.recipe.search
+        begun, search = self.clock(), self.recipe.search
         problem = self.problem(order.row)
         before = problem.simulated
-        rungs = [*every_pass(search.ladder), *every_pass(search.robust_ladder)]
         plan = Planner(
             problem,
             search,
-            rungs[order.rung],
+            search.rungs[order.rung],
             limits=self.limits,
             grace=grace_steps(self.builder.bank.fps),
             seed=[self.recipe.seed, order.row, order.rung],
@@ -424,7 +431,7 @@ class _Worker:
         if summary["converted"] and self.recipe.train.certify:
             rollout.errors = json.dumps(summary["errors"])
             certificate = certify(rollout, model=problem.scene.model)
-        spent = time.process_time() - begun
+        spent = self.clock() - begun
         return _Found(order, rollout, certificate, spent, problem.simulated - before)
 
 
@@ -433,7 +440,8 @@ _worker: list[_Worker] = []  # of this process
 
 def _open_worker(recipe: SearchRecipe, provenance: dict[str, str]) -> None:
     live_with_parent()
-    torch.set_num_threads(1)
+    if recipe.search.engine == "cpu":  # a process a core
+        torch.set_num_threads(1)
     _worker.append(_Worker(recipe, provenance))
 
 

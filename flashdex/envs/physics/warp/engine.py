@@ -93,6 +93,18 @@ def _kinds(overflow: Any) -> dict[str, int]:
     }
 
 
+def count_overflow(flags: Tensor) -> dict[str, int]:
+    """Worlds that ran out of room, by kind, of warp's flags (N,), which are cleared."""
+    mjw = require_warp()[1]
+    found = flags.clone()
+    flags.zero_()
+    worlds = {
+        kind: int(((found & int(bits)) != 0).sum())
+        for kind, bits in _kinds(mjw.OverflowType).items()
+    }
+    return {kind: count for kind, count in worlds.items() if count}
+
+
 class WarpPhysics(Physics):
     """One model of mujoco_warp whose rows follow each world's motion; see ``Physics``.
 
@@ -174,14 +186,7 @@ class WarpPhysics(Physics):
 
     def take_overflow(self) -> dict[str, int]:
         """Worlds whose room was too small since the last call; see ``Physics``."""
-        mjw = require_warp()[1]
-        found = self._overflow.clone()
-        self._overflow.zero_()
-        worlds = {
-            kind: int(((found & int(bits)) != 0).sum())
-            for kind, bits in _kinds(mjw.OverflowType).items()
-        }
-        return {kind: count for kind, count in worlds.items() if count}
+        return count_overflow(self._overflow)
 
     def _launch_free(self) -> None:
         for _ in range(self.decimation):

@@ -35,19 +35,17 @@ class Rung:
 
 def _ladder() -> list[Rung]:
     return [
-        Rung(samples=16, rounds=1, horizon=24),
-        Rung(samples=24, rounds=2, horizon=24),
-        Rung(samples=48, rounds=3, horizon=30),
-        Rung(samples=64, rounds=4, horizon=36),
-        Rung(samples=96, rounds=4, horizon=36, spread=1.5),
+        Rung(samples=16, rounds=1, horizon=24, retries=4),
+        Rung(samples=24, rounds=2, horizon=24, retries=8),
+        Rung(samples=48, rounds=3, horizon=30, retries=8),
+        Rung(samples=64, rounds=4, horizon=36, retries=8, spread=1.5, tries=10),
     ]
 
 
 def _robust_ladder() -> list[Rung]:
     return [
-        Rung(samples=16, rounds=1, horizon=24, worlds=4),
-        Rung(samples=24, rounds=2, horizon=24, worlds=4),
-        Rung(samples=32, rounds=3, horizon=30, worlds=6),
+        Rung(samples=48, rounds=3, horizon=24, retries=6, worlds=4),
+        Rung(samples=64, rounds=3, horizon=30, retries=8, worlds=6, tries=10),
     ]
 
 

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from flashdex.envs.physics.warp.rollout import WarpRollout
 
 _LOG = logging.getLogger(__name__)
+# kept on a device: samples and finalists, with and without more effort, in one world
+# and in several; at the end of a motion the horizon alone differs
+BATCHES = 6
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 Array = NDArray[np.float64]
@@ -88,7 +91,7 @@ class Warp:
 
         require_warp()
         self._physics = physics
-        self._batch: WarpRollout | None = None
+        self._batches: dict[tuple[int, ...], WarpRollout] = {}
         self._most = sys.maxsize  # worlds that there is room for
 
     def __call__(self, worlds: Worlds, ctrl: Array, first: int) -> Played:
@@ -108,13 +111,17 @@ class Warp:
 
         while True:
             size = max(1, min(count, self._most // len(models)))
-            batch = self._batch
-            if batch is not None and batch.models is models and batch.count == size:
+            key = (size, *map(id, models))  # a batch keeps its models, and their ids
+            if batch := self._batches.get(key):
                 return batch
-            self._batch = batch = None  # its memory is free before more is taken
+            if len(self._batches) >= BATCHES:
+                self._batches.clear()
             try:
-                self._batch = WarpRollout(models, size, self._physics)
+                self._batches[key] = WarpRollout(models, size, self._physics)
             except NoRoomError as error:
+                if self._batches:  # their memory may be enough
+                    self._batches.clear()
+                    continue
                 if size == 1:
                     raise
                 self._most = size * len(models) // 2
@@ -123,7 +130,11 @@ class Warp:
     @property
     def overflow(self) -> dict[str, int]:
         """Worlds on the device that have run out of room, by kind."""
-        return {} if self._batch is None else self._batch.overflow
+        found: dict[str, int] = {}
+        for batch in self._batches.values():
+            for kind, count in batch.overflow.items():
+                found[kind] = found.get(kind, 0) + count
+        return found
 
 
 def make_simulator(engine: SampleEngine, physics: PhysicsConfig) -> Simulator | None:

@@ -13,7 +13,6 @@ from scipy.spatial import KDTree
 Array = NDArray[np.float64]
 
 NEIGHBOURS = (4, 16, 64)  # samples tried around a node until its distance is proven
-EXACT_WITHIN = 0.03  # m; farther nodes of a grid take the nearest sample's distance
 NODE_CHUNK = 1024  # nodes whose candidate triangles are held at once: in the cache
 WINDING_PAIRS = 200_000  # node-triangle pairs held at once
 
@@ -23,8 +22,7 @@ def make_distance_grid(
 ) -> tuple[NDArray[np.float32], Array, float]:
     """Sample the signed distance on a cube around the mesh, in the mesh's frame.
 
-    Distances up to `EXACT_WITHIN` are exact point-triangle distances, farther ones at
-    most ``spacing^2 / (6 d)`` too large (see :func:`surface_distance`); the
+    Distances are exact point-triangle distances (see :func:`surface_distance`); the
     sign is that of the generalised winding number minus one half.
 
     Of a watertight mesh one sign serves each region that it bounds; otherwise every
@@ -41,9 +39,7 @@ def make_distance_grid(
     axis = np.arange(resolution) * spacing
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1) + origin
     triangles = np.asarray(mesh.triangles, dtype=np.float64)
-    distance = surface_distance(
-        mesh, nodes.reshape(-1, 3), step=spacing, exact_within=EXACT_WITHIN
-    )
+    distance = surface_distance(mesh, nodes.reshape(-1, 3), step=spacing)
     distance = distance.reshape(nodes.shape[:3])
     if watertight:
         inside = _inside_by_component(triangles, nodes, distance, spacing)
@@ -54,13 +50,7 @@ def make_distance_grid(
     return values, origin, spacing
 
 
-def surface_distance(
-    mesh: trimesh.Trimesh,
-    points: Array,
-    *,
-    step: float,
-    exact_within: float = np.inf,
-) -> Array:
+def surface_distance(mesh: trimesh.Trimesh, points: Array, *, step: float) -> Array:
     """Unsigned distance from points to the nearest triangle.
 
     Triangles, edges and corners are sampled no farther than ``step`` apart, which puts
@@ -74,8 +64,6 @@ def surface_distance(
         mesh: triangles, m.
         points: m, (N, 3).
         step: largest distance between neighbouring samples, m.
-        exact_within: beyond, the distance of the nearest sample is taken, m; it is at
-            most ``h^2 / (2 d)`` too large.
     """
     area = mesh.area_faces
     faces = mesh.faces[area > 1e-12 * area.max()]
@@ -84,10 +72,6 @@ def surface_distance(
     tree = KDTree(samples)
     best = np.full(len(points), np.inf)
     proven = np.zeros(len(points), dtype=bool)
-    if np.isfinite(exact_within):
-        nearest = np.asarray(tree.query(points)[0])
-        proven = nearest > np.hypot(exact_within, cover)
-        best[proven] = nearest[proven]
     for k in NEIGHBOURS:
         k = min(k, len(samples))
         todo = np.flatnonzero(~proven)

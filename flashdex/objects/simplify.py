@@ -46,10 +46,10 @@ def simplify(mesh: trimesh.Trimesh, *, max_faces: int) -> trimesh.Trimesh:
         chosen = chosen[np.isfinite(cost[chosen])]
         if not len(chosen):
             break
-        moved, bad = _without_flips(vertices, faces, edges[chosen], target[chosen])
+        bad = _turned_over(vertices, faces, edges[chosen], target[chosen])
         refused = np.append(refused, edges[chosen[bad]] @ np.array([len(vertices), 1]))
         kept = edges[chosen[~bad]]
-        vertices[kept[:, 0]] = moved[~bad]
+        vertices[kept[:, 0]] = target[chosen[~bad]]
         quadrics[kept[:, 0]] += quadrics[kept[:, 1]]
         place = np.arange(len(vertices))
         place[kept[:, 1]] = kept[:, 0]
@@ -128,10 +128,10 @@ def _apart(edges: Index, cost: Array, count: int) -> Index:
     return best[rank[best] <= max(SHARE * len(edges), rank[best[0]])]
 
 
-def _without_flips(
+def _turned_over(
     vertices: Array, faces: Index, edges: Index, target: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Where edges go, and whether a triangle would turn over or vanish, (E,)."""
+) -> NDArray[np.bool_]:
+    """Whether an edge's collapse would turn a triangle over or flatten it, (E,)."""
     owner = np.full(len(vertices), -1)
     owner[edges] = np.arange(len(edges))[:, None]
     after = vertices.copy()
@@ -144,7 +144,7 @@ def _without_flips(
     turned = (old * new).sum(axis=1) <= LEAST_COSINE * size
     bad = np.zeros(len(edges), dtype=bool)
     bad[owners[touched].max(axis=1)[turned]] = True
-    return target, bad
+    return bad
 
 
 def _normals(corners: Array) -> Array:

@@ -66,6 +66,9 @@ def add_data_verbs(
         "--workers", type=count, default=1, help="processes (%(default)s)"
     )
     verb.add_argument("--ray", action="store_true", help="use a Ray cluster")
+    verb.add_argument(
+        "--select", nargs="+", metavar="NAME", help="only recordings so named (globs)"
+    )
     verb.add_argument("--limit", type=count, help="only the first N recordings")
     verb.add_argument(
         "--seed",
@@ -160,6 +163,7 @@ def _options(args: argparse.Namespace) -> SourceOptions:
         models=args.models,
         splits=args.splits,
         seed=args.seed,
+        select=None if args.select is None else tuple(args.select),
         limit=args.limit,
     )
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ MANO_HINT = (
     "MANO is the hand model of mano.is.tue.mpg.de (registration): give the folder with "
     "MANO_LEFT.pkl and MANO_RIGHT.pkl."
 )
+_LOG = logging.getLogger(__name__)
 REGISTERED: dict[str, Source] = {}
 DEFINED = re.compile(r"^SOURCE = Source\(", re.MULTILINE)
 
@@ -121,15 +123,18 @@ def list_recordings(source: str, options: SourceOptions) -> list[Recording]:
 def _select(recordings: list[Recording], options: SourceOptions) -> list[Recording]:
     """Recordings that are asked for, in the order in which they are.
 
-    A motion is called like its recording, or like it and a piece of it: where a name is
-    that of no recording, all are needed to find it.
+    A motion is called like its recording, or like it and a piece of it: where a pattern
+    tells neither, all are needed to find it.
     """
     if options.select is None:
         return recordings if options.limit is None else recordings[: options.limit]
     chosen: dict[str, Recording] = {}
     for pattern in options.select:
         found = {r.name: r for r in recordings if is_named(r.name, pattern)}
+        found = found or {r.name: r for r in recordings if pattern.startswith(r.name)}
         if not found:
+            text = "'%s' names no recording; all %d are prepared to find such motions"
+            _LOG.warning(text, pattern, len(recordings))
             return recordings
         chosen |= {name: r for name, r in found.items() if name not in chosen}
     return list(chosen.values())[: options.limit]

@@ -29,7 +29,7 @@ from flashdex.system.files import open_atomic, waiting_lock
 
 logger = logging.getLogger(__name__)
 
-CACHE_VERSION = 2  # raise when the same mesh and settings give another asset
+CACHE_VERSION = 3  # raise when the same mesh and settings give another asset
 MAX_VISUAL_FACES = 5000
 MAX_WORK_FACES = 32000  # more only cost time in CoACD and the winding number
 # what a torn, damaged or foreign file in the cache raises

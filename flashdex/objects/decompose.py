@@ -14,16 +14,22 @@ MAX_MEMORY, MAX_SECONDS = 8 << 30, 900
 
 
 def run_coacd(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], **options: Any
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    *,
+    seconds: int | None = None,
+    **options: Any,
 ) -> list[NDArray[np.float64]]:
     """Corners of the convex parts that CoACD finds, each (V, 3).
+
+    ``seconds`` are of CPU time, by default `MAX_SECONDS`.
 
     Raises:
         LimitError: it failed or took too long: it does so every time.
         MemoryError: it crashed, or the machine has not enough memory for it now.
     """
     given = vertices.tolist(), faces.tolist(), options
-    limits = {"memory": MAX_MEMORY, "seconds": MAX_SECONDS}
+    limits = {"memory": MAX_MEMORY, "seconds": min(seconds or MAX_SECONDS, MAX_SECONDS)}
     try:
         return [np.array(part) for part in run_limited(_decompose, *given, **limits)]
     except LimitError as error:

@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 Array = NDArray[np.float64]
 
 NEIGHBOURS = (4, 16, 64)  # samples tried around a node until its distance is proven
-NODE_CHUNK = 16384  # nodes whose candidate triangles are held in memory at once
-WINDING_PAIRS = 4_000_000  # node-triangle pairs held in memory at once
+NODE_CHUNK = 1024  # nodes whose candidate triangles are held at once: in the cache
+WINDING_PAIRS = 200_000  # node-triangle pairs held at once
 
 
 def make_distance_grid(

@@ -38,7 +38,7 @@ class MotionsConfig:
     select: Annotated[list[str], Field(min_length=1)] | None = None
     """Names or globs of the motions to keep; null keeps all."""
     count: int | None = number(None, low=1, high=10**6)
-    """How many motions to keep or, for procedural ones, to make; null = all."""
+    """The first so many motions that are kept or, procedural, made; null = all."""
     seed: int = number(0, low=0, high=SEED_MAX)
     """Seed of procedural motions and of preparation."""
     control_hz: float = number(60.0, low=1, high=10_000)

@@ -93,12 +93,13 @@ def make_order(recipe: Recipe) -> Order:
         models=None if motions.models is None else Path(motions.models),
         seed=motions.seed,
         select=select,
-        limit=motions.count,
+        limit=motions.count if made_up else None,
     )
     settings = MotionSettings(
         hand=recipe.hand, control_hz=motions.control_hz, speed=motions.speed
     )
-    return Order(motions.source, options, settings)
+    enough = None if made_up else motions.count
+    return Order(motions.source, options, settings, enough=enough)
 
 
 def library_name(recipe: Recipe) -> str:
@@ -117,17 +118,18 @@ def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
     """
     chosen = list(range(library.num_motions))
     if recipe.motions.select is not None:
-        chosen = []
+        chosen, missing = [], []
         for pattern in recipe.motions.select:
             if recipe.motions.count is not None and len(chosen) >= recipe.motions.count:
                 break  # of the others none need be there
             rows = [i for i, n in enumerate(library.names) if is_named(n, pattern)]
-            if not rows:
-                raise LibraryError(
-                    f"{library.path}: motions.select '{pattern}' matches none of "
-                    f"{', '.join(library.names)}."
-                )
+            missing += [] if rows else [pattern]
             chosen += [r for r in rows if r not in chosen]
+        if missing and len(chosen) < (recipe.motions.count or len(library.names) + 1):
+            raise LibraryError(
+                f"{library.path}: motions.select '{missing[0]}' matches none of "
+                f"{', '.join(library.names)}."
+            )
     if recipe.motions.count is not None:
         chosen = chosen[: recipe.motions.count]
     if len(chosen) == library.num_motions:

@@ -118,13 +118,17 @@ def shelf(monkeypatch):
         (("bowl", "cup_*"), 1, ["bowl"]),
         (("cup_*", "cup_2"), 5, ["cup_1", "cup_2"]),
         (("pour[1]",), None, ["pour[1]", "pour1"]),  # literally, and as a glob
-        (("cup_1_b",), 1, ["cup_1", "cup_2", "pour[1]", "pour1", "bowl"]),  # a piece
+        (("cup_1_b",), None, ["cup_1"]),  # a piece
+        (("*_b",), 1, ["cup_1", "cup_2", "pour[1]", "pour1", "bowl"]),
     ],
-    ids=["all", "first", "chosen", "chosen_first", "once", "literal", "piece"],
+    ids=["all", "first", "chosen", "chosen_first", "once", "literal", "piece", "any"],
 )
 def test_only_what_is_asked_for_is_prepared(shelf, select, limit, expected):
     options = SourceOptions(select=select, limit=limit)
     assert [r.name for r in list_recordings(shelf, options)] == expected
+
+
+BOWL_AND_CUPS = ["bowl", "cup_1", "cup_2"]
 
 
 def test_a_recipe_asks_for_its_selection_only(shelf):
@@ -137,6 +141,7 @@ def test_a_recipe_asks_for_its_selection_only(shelf):
         config = MotionsConfig(source="myodm", select=["bowl", "cup_*"], **motions)
         return Recipe(name="any", total_env_steps=1, motions=config)
 
-    options = make_order(order(count=1)).options
-    assert [r.name for r in list_recordings(shelf, options)] == ["bowl"]
+    asked = make_order(order(count=1))
+    assert [r.name for r in list_recordings(shelf, asked.options)] == BOWL_AND_CUPS
+    assert asked.enough == 1
     assert library_name(order()) != library_name(order(count=1))

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from flashdex import datasets
 from flashdex.datasets import list_recordings, register
 from flashdex.datasets.procedural.reader import procedural
 from flashdex.datasets.source import Recording, Source, SourceOptions
@@ -95,6 +96,26 @@ def test_prepared_motion_comes_from_the_disk_as_it_was(settings):
     assert stored.record.quality["contact"].any()
     assert stored.record.info == made.record.info
     assert stored.record.objects[0].name == computed.record.objects[0].name
+
+
+def test_no_more_is_prepared_than_is_asked_for(settings, tmp_path, monkeypatch):
+    (box,) = procedural(0, kinds=["pick_box_right"])
+    reads = {
+        "short": partial(too_short, "short"),
+        "one": partial(list, [replace(box, name="one")]),
+        "two": partial(list, [replace(box, name="two")]),
+        "three": never,
+    }
+    listed = [Recording(name=name, read=read) for name, read in reads.items()]
+    monkeypatch.setattr(datasets, "REGISTERED", {})
+    register(Source(name="pile", list=lambda _: listed, about="", needs=()))
+    order = Order("pile", settings=settings, enough=2)
+    library = run_order(order, tmp_path / "two", progress=False)
+    assert list(library.names) == ["one", "two"]
+    options = SourceOptions(select=("two", "*"))
+    order = replace(order, options=options, enough=1)
+    library = run_order(order, tmp_path / "one", progress=False)
+    assert list(library.names) == ["two"]
 
 
 def test_changed_content_settings_or_lost_object_is_prepared_again(settings, recording):

@@ -115,6 +115,20 @@ def test_a_selection_keeps_the_hashes_of_its_motions(library):
     assert part.content_hash == library.content_hash
 
 
+def test_what_was_not_kept_does_not_count(library):
+    def selected(**asked):
+        recipe = recipe_of(library=str(library.path), **asked)
+        return list(
+            build.select_motions(MotionLibrary.load(library.path), recipe).names
+        )
+
+    asked = ["rejected", "both", "right_box"]
+    assert selected(select=asked, count=1) == ["both"]
+    for count in (None, 3):
+        with pytest.raises(LibraryError, match="'rejected' matches none"):
+            selected(select=asked, count=count)
+
+
 def test_verify_tells_each_fault_of_a_library(copy):
     assert verify(copy).findings == []
     (mass,) = copy.glob("data-*/objects/mass.npy")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.datasets import list_recordings
-from flashdex.datasets.source import Recording, SourceOptions
+from flashdex.datasets.source import Recording, SourceOptions, is_named
 from flashdex.errors import DemoError, LibraryError
 from flashdex.hands.spec import load_hand
 from flashdex.motions.findings import reject
@@ -44,6 +44,7 @@ class Order:
     source: str  # name of a reader, see ``flashdex.datasets.source_names``
     options: SourceOptions = field(default_factory=SourceOptions)
     settings: MotionSettings = field(default_factory=MotionSettings)
+    enough: int | None = None  # motions that are kept; what comes after is not prepared
 
     def recordings(self) -> list[Recording]:
         """The recordings, listed but not read."""
@@ -86,7 +87,8 @@ def run_order(
     recordings, doubles = _without_doubles(listed)
     jobs = [Job(recording, settings) for recording in recordings]
     _tell_start(jobs, workers)
-    outcomes = run_jobs(jobs, workers=workers, ray=ray, progress=progress)
+    how = {"workers": workers, "ray": ray, "progress": progress}
+    outcomes = _run_enough(jobs, order, **how)
     rows = [row for outcome in outcomes for row in outcome.rows] + doubles
     writer = LibraryWriter(
         out,
@@ -100,6 +102,20 @@ def run_order(
     return MotionLibrary.load(writer.write(report=make_report(rows)))
 
 
+def _run_enough(jobs: list[Job], order: Order, **how: Any) -> list[Outcome]:
+    """Outcomes of all jobs, or of as many, in their order, as keep enough motions."""
+    outcomes: list[Outcome] = []
+    patterns = order.options.select or ("*",)
+    missing = len(jobs) if order.enough is None else order.enough
+    while missing > 0 and len(outcomes) < len(jobs):
+        new = run_jobs(jobs[len(outcomes) :][:missing], **how)
+        outcomes += new
+        rows = [row for outcome in new for row in outcome.rows]
+        kept = [row["motion"] for row in rows if row["status"] != "rejected"]
+        missing -= sum(any(is_named(name, p) for p in patterns) for name in kept)
+    return outcomes
+
+
 def _tell_start(jobs: list[Job], workers: int) -> None:
     if workers < 1:
         raise DemoError(f"--workers is {workers}; at least 1 is needed.")
@@ -109,7 +125,7 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
         with suppress(OSError):
             known += cache_file(job.recording, job.settings).is_file()
     left = len(jobs) - known
-    more = f", {left} to do; a new mesh can take a minute" if left else ""
+    more = f", {left} to do; a new mesh takes seconds, a hard one a minute" if left else ""
     text = "%d of %d recordings are in the cache %s%s"
     _LOG.info(text, known, len(jobs), root, more)
 

@@ -1,19 +1,32 @@
 """Runs of the search: conversions that verify, and nothing done twice or lost."""
 
 import dataclasses
+import os
 import shutil
+import signal
+import sys
+import time
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import pytest
 
 from flashdex.cli.main import main
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
-from flashdex.recipe import LoggerConfig, MotionsConfig, SearchRecipe, validate
+from flashdex.recipe import (
+    LoggerConfig,
+    MotionsConfig,
+    SearchRecipe,
+    dump_recipe,
+    validate,
+)
 from flashdex.reports.run.terminal import run_table
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.search.config import Rung, SearchConfig
+from flashdex.system.children import PYTHON
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.run_files import read_metrics, read_sessions
 from flashdex.training.loaded import verify
@@ -217,4 +230,52 @@ def test_a_run_of_other_things_is_no_source(left, capsys):
     with pytest.raises(FlashdexError, match="another content of 1 motions, 'both'"):
         search(recipe, source=source)
     assert not Path(recipe.run_dir).exists()
-    assert main(["search", "x", "--from", str(source), "--resume", str(source)]) == 2
+
+
+def workers_of(pid):
+    """Processes of the pool of a search."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [n for n in map(int, children) if "spawn_main" in command_of(n)]
+
+
+def command_of(pid):
+    """Empty for a process that has ended."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    return ""
+
+
+def wait_until(is_true):
+    end = time.monotonic() + 120
+    while not is_true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+@pytest.mark.parametrize("victim", ["search", "worker"])
+def test_a_search_that_is_killed_goes_on(recipe, tmp_path, inline, victim):
+    ladder = [CHEAP, Rung(samples=24, rounds=2, horizon=16)]
+    found = dataclasses.replace(LADDERS, workers=2, ladder=ladder)
+    recipe = dataclasses.replace(only(recipe, "left_ball", "both"), search=found)
+    file, run = tmp_path / "tiny.yaml", Path(recipe.run_dir)
+    file.write_text(dump_recipe(recipe))
+    command = [*PYTHON, "-m", "flashdex.cli", "search", str(file)]
+    with Popen(command, stderr=PIPE, text=True) as process:
+        lines = run / CONVERSIONS
+        wait_until(lambda: lines.exists() and lines.read_bytes().count(b"\n"))
+        workers = workers_of(process.pid)
+        assert len(workers) == 2
+        os.kill(process.pid if victim == "search" else workers[0], signal.SIGKILL)
+        _, told = process.communicate(timeout=120)
+    wait_until(lambda: not any(map(command_of, workers)))
+    assert process.returncode == (-signal.SIGKILL if victim == "search" else 2)
+    assert victim == "search" or "a process of the search has died" in told
+    before = read_ledger(lines)
+    assert 0 < len(before) < 4
+    resume_search(run)
+    after = read_ledger(lines)
+    assert after[: len(before)] == before
+    every = [(x["motion"], x["rung"]) for x in after]
+    assert sorted(every) == [(m, r) for m in ("both", "left_ball") for r in (0, 1)]
+    assert verify(run).holds

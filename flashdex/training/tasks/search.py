@@ -332,7 +332,7 @@ class _Session:
 def _end(pool: ProcessPoolExecutor) -> None:
     """End the workers at once: what they are at is done again after a resume."""
     for process in list((pool._processes or {}).values()):
-        process.terminate()
+        process.kill()  # they ignore what ends the search, and write nothing
     pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -31,6 +31,7 @@ from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.run_files import read_metrics, read_sessions
 from flashdex.training.loaded import verify
 from flashdex.training.run_dir import train
+from flashdex.training.tasks import planning
 from flashdex.training.tasks import search as searching
 from flashdex.training.tasks.search import resume_search, search
 
@@ -67,7 +68,7 @@ def inline(monkeypatch):
         _processes = None
 
         def __init__(self, count, begin, *given):
-            searching._worker[:] = [searching._Worker(*given)]
+            planning._worker[:] = [planning.Worker(*given)]
 
         def submit(self, work, order):
             future = Future()
@@ -75,7 +76,7 @@ def inline(monkeypatch):
             return future
 
         def shutdown(self, **kwargs):
-            searching._worker.clear()
+            planning._worker.clear()
 
     monkeypatch.setattr(searching, "spawning_pool", Pool)
 
@@ -183,13 +184,13 @@ def test_a_search_goes_on_from_what_a_run_left(left, monkeypatch):
     source, recipe = left
     misses = {path.stem: path.read_bytes() for path in (source / "misses").iterdir()}
     asked = []
-    make = searching.Planner
+    make = planning.Planner
 
     def planner(problem, *given, start, **more):
         asked.append((problem.row, start))
         return make(problem, *given, start=start, **more)
 
-    monkeypatch.setattr(searching, "Planner", planner)
+    monkeypatch.setattr(planning, "Planner", planner)
     take = searching._Session._take
 
     def dying(self, found, progress):

@@ -191,6 +191,11 @@ def _replay(args: argparse.Namespace) -> int:
 
     truth, why = open_truth(args.run_dir)
     verified = verify_run(args.run_dir, truth)
+    if verified.holds and not verified.rollouts:
+        raise FlashdexError(
+            f"{args.run_dir}: no stored rollout in '{ROLLOUTS}/': nothing has been "
+            "converted yet."
+        )
     for one in verified.rollouts:
         say(replay_line(one.motion, one.stored, one.found, holds=one.holds))
     for line in finding_lines(verified.findings, why):

@@ -8,6 +8,8 @@ from typing import Any
 
 from flashdex.metrics.criteria_table import limits_of
 
+SPEED = "convert/per_hour"  # of a clock that went on between two readings
+SPEED_TOLERANCE = 0.05
 UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
 # of a motion's first pass, what a better proof of a later one replaces
 NEWEST = ("certified", "verdict", "survived")
@@ -174,3 +176,33 @@ class Tally:
         if hours > 0:
             out["convert/per_hour"] = self.num_converted / hours
         return out
+
+
+def count_faults(
+    records: list[dict[str, Any]],
+    lines: list[dict[str, Any]],
+    tally: Tally,
+    *,
+    is_whole: bool,
+) -> list[str]:
+    """The first record of the metrics that does not count the lines there were.
+
+    ``is_whole``: the last one counts all of them.
+    """
+    counted = 0
+    for number, record in enumerate(records, start=1):
+        attempts = record.get("convert/attempts", -1)
+        if not counted <= attempts <= len(lines):
+            return [f"record {number}: convert/attempts is {attempts:g}"]
+        for line in lines[counted : int(attempts)]:
+            tally.count(line)
+        counted = int(attempts)
+        for key, value in tally.metrics(record["hours"]).items():
+            slack = SPEED_TOLERANCE if key == SPEED else 0.0
+            said = record.get(key, math.nan)
+            if not abs(said - value) <= slack * value + 1e-9:
+                text = f"record {number}: {key} is {said:g}, by the lines {value:g}"
+                return [text]
+    if is_whole and counted != len(lines):
+        return [f"{counted} attempts are counted of {len(lines)} lines"]
+    return []

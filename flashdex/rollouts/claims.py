@@ -12,14 +12,19 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flashdex.errors import FlashdexError
-from flashdex.metrics.tally import UNMOVED, Tally, follow_misses, is_unmoved
+from flashdex.metrics.tally import (
+    UNMOVED,
+    Tally,
+    count_faults,
+    follow_misses,
+    is_unmoved,
+)
 from flashdex.recipe import Recipe, RunRecipe, parse_recipe
 from flashdex.recipe.reader import parse_yaml
 from flashdex.recipe.store import DEFAULT_TASK, SEARCH_TASK
 from flashdex.rollouts.findings import Notes, at, is_date
 from flashdex.rollouts.ledger import (
     CONVERSIONS,
-    count_faults,
     line_faults,
     read_ledger,
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -351,10 +350,6 @@ def _is_better(certificate: Certificate | None, before: dict[str, Any]) -> bool:
     )
 
 
-SPEED = "convert/per_hour"  # of a clock that went on between two readings
-SPEED_TOLERANCE = 0.05
-
-
 def line_faults(line: dict[str, Any], of_run: dict[str, Any]) -> list[str]:
     """What a line says against itself or its run, of which all lines say ``of_run``."""
     found = [
@@ -383,33 +378,3 @@ def _is_within(errors: dict[str, float], criterion: str) -> bool:
         for name, value in errors.items()
         if name not in ("lift", "path")
     )
-
-
-def count_faults(
-    records: list[dict[str, Any]],
-    lines: list[dict[str, Any]],
-    tally: Tally,
-    *,
-    is_whole: bool,
-) -> list[str]:
-    """The first record of the metrics that does not count the lines there were.
-
-    ``is_whole``: the last one counts all of them.
-    """
-    counted = 0
-    for number, record in enumerate(records, start=1):
-        attempts = record.get("convert/attempts", -1)
-        if not counted <= attempts <= len(lines):
-            return [f"record {number}: convert/attempts is {attempts:g}"]
-        for line in lines[counted : int(attempts)]:
-            tally.count(line)
-        counted = int(attempts)
-        for key, value in tally.metrics(record["hours"]).items():
-            slack = SPEED_TOLERANCE if key == SPEED else 0.0
-            said = record.get(key, math.nan)
-            if not abs(said - value) <= slack * value + 1e-9:
-                text = f"record {number}: {key} is {said:g}, by the lines {value:g}"
-                return [text]
-    if is_whole and counted != len(lines):
-        return [f"{counted} attempts are counted of {len(lines)} lines"]
-    return []

@@ -1,24 +1,37 @@
 """Runs of the search: conversions that verify, and nothing done twice or lost."""
 
 import dataclasses
+import os
 import shutil
+import signal
 import sys
+import time
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import pytest
 
 from flashdex.cli.main import main
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.errors import FlashdexError
-from flashdex.recipe import LoggerConfig, MotionsConfig, SearchRecipe, validate
+from flashdex.recipe import (
+    LoggerConfig,
+    MotionsConfig,
+    SearchRecipe,
+    dump_recipe,
+    validate,
+)
 from flashdex.reports.run.terminal import run_table
 from flashdex.rollouts.ledger import CONVERSIONS, read_ledger
 from flashdex.search.config import Rung, SearchConfig
+from flashdex.system.children import PYTHON
 from flashdex.system.jsonl import read_object, write_object
 from flashdex.system.run_files import read_metrics, read_sessions
 from flashdex.training.loaded import verify
 from flashdex.training.run_dir import load_run_recipe, train
+from flashdex.training.tasks import planning
 from flashdex.training.tasks import search as searching
 from flashdex.training.tasks.search import resume_search, search
 
@@ -55,7 +68,7 @@ def inline(monkeypatch):
         _processes = None
 
         def __init__(self, count, begin, *given):
-            searching._worker[:] = [searching._Worker(*given)]
+            planning._worker[:] = [planning.Worker(*given)]
 
         def submit(self, work, order):
             future = Future()
@@ -63,7 +76,7 @@ def inline(monkeypatch):
             return future
 
         def shutdown(self, **kwargs):
-            searching._worker.clear()
+            planning._worker.clear()
 
     monkeypatch.setattr(searching, "spawning_pool", Pool)
 
@@ -173,13 +186,13 @@ def test_a_search_goes_on_from_what_a_run_left(left, monkeypatch):
     source, recipe = left
     misses = {path.stem: path.read_bytes() for path in (source / "misses").iterdir()}
     asked = []
-    make = searching.Planner
+    make = planning.Planner
 
     def planner(problem, *given, start, **more):
         asked.append((problem.row, start))
         return make(problem, *given, start=start, **more)
 
-    monkeypatch.setattr(searching, "Planner", planner)
+    monkeypatch.setattr(planning, "Planner", planner)
     take = searching._Session._take
 
     def dying(self, found, progress):
@@ -220,7 +233,6 @@ def test_a_run_of_other_things_is_no_source(left, capsys):
     with pytest.raises(FlashdexError, match="another content of 1 motions, 'both'"):
         search(recipe, source=source)
     assert not Path(recipe.run_dir).exists()
-    assert main(["search", "x", "--from", str(source), "--resume", str(source)]) == 2
 
 
 @pytest.mark.slow
@@ -252,3 +264,52 @@ def test_warp_that_is_not_installed_is_said_before_anything_is_written(
     with pytest.raises(FlashdexError, match="'warp'"):
         search(dataclasses.replace(recipe, search=config))
     assert not Path(recipe.run_dir).exists()
+
+
+def workers_of(pid):
+    """Processes of the pool of a search."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [n for n in map(int, children) if "spawn_main" in command_of(n)]
+
+
+def command_of(pid):
+    """Empty for a process that has ended."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    return ""
+
+
+def wait_until(is_true):
+    end = time.monotonic() + 120
+    while not is_true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+@pytest.mark.parametrize("victim", ["search", "worker"])
+def test_a_search_that_is_killed_goes_on(recipe, tmp_path, inline, victim):
+    found = dataclasses.replace(LADDERS, workers=2, ladder=[CHEAP, CHEAP])
+    recipe = dataclasses.replace(only(recipe, "left_ball", "both"), search=found)
+    file, run = tmp_path / "tiny.yaml", Path(recipe.run_dir)
+    file.write_text(dump_recipe(recipe))
+    command = [*PYTHON, "-m", "flashdex.cli", "search", str(file)]
+    with Popen(command, stderr=PIPE, text=True) as process:
+        lines = run / CONVERSIONS
+        wait_until(lambda: lines.exists() and lines.read_bytes().count(b"\n"))
+        workers = workers_of(process.pid)
+        assert len(workers) == 2
+        os.kill(process.pid if victim == "search" else workers[0], signal.SIGKILL)
+        _, told = process.communicate(timeout=120)
+    wait_until(lambda: not any(map(command_of, workers)))
+    assert process.returncode == (-signal.SIGKILL if victim == "search" else 2)
+    assert victim == "search" or "a process of the search has died" in told
+    before = read_ledger(lines)
+    assert 0 < len(before) < 4
+    resume_search(run)
+    after = read_ledger(lines)
+    assert after[: len(before)] == before
+    every = [(x["motion"], x["rung"]) for x in after]
+    assert sorted(every) == [(m, r) for m in ("both", "left_ball") for r in (0, 1)]
+    assert verify(run).holds

@@ -125,7 +125,9 @@ def _tell_start(jobs: list[Job], workers: int) -> None:
         with suppress(OSError):
             known += cache_file(job.recording, job.settings).is_file()
     left = len(jobs) - known
-    more = f", {left} to do; a new mesh takes seconds, a hard one a minute" if left else ""
+    more = (
+        f", {left} to do; a new mesh takes seconds, a hard one a minute" if left else ""
+    )
     text = "%d of %d recordings are in the cache %s%s"
     _LOG.info(text, known, len(jobs), root, more)
 

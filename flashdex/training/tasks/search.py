@@ -11,31 +11,17 @@ from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from flashdex.envs.physics.state_map import StateMap
-from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
-from flashdex.errors import FlashdexError, RunError
+from flashdex.errors import RunError
 from flashdex.metrics.tally import is_unmoved, miss_distance
 from flashdex.recipe import SearchRecipe, dump_recipe, expect_kind
-from flashdex.rollouts.build import grace_steps
-from flashdex.rollouts.certificate import Certificate, certify
 from flashdex.rollouts.ledger import Ledger, read_ledger
-from flashdex.rollouts.recorder import Episode
-from flashdex.rollouts.rollout import MAX_FILE, OF_SEARCH, Rollout
-from flashdex.rollouts.scorer import live_with_parent
+from flashdex.rollouts.rollout import OF_SEARCH
 from flashdex.search.config import SearchConfig
-from flashdex.search.costs import ErrorLimits, shares
-from flashdex.search.plan import Planner
-from flashdex.search.problem import Problem, Trial
 from flashdex.search.simulate import make_simulator
-from flashdex.system.arrays import hash_content
 from flashdex.system.children import spawning_pool
 from flashdex.system.files import RunHold, own_file
 from flashdex.system.run_files import (
@@ -57,6 +43,7 @@ from flashdex.training.session import (
     end_session,
     interruptible,
 )
+from flashdex.training.tasks.planning import Found, Order, open_worker, work
 from flashdex.training.tasks.source import (
     Source,
     forget_source,
@@ -67,7 +54,6 @@ from flashdex.training.tasks.tracking import TrackingTask
 from flashdex.training.trainer import Progress
 
 _LOG = logging.getLogger(__name__)
-KEPT = 4  # problems that a worker keeps
 WAIT_S = 0.5  # between looks at signals
 
 
@@ -154,27 +140,6 @@ class _Progress:
     has_start: bool = False  # a miss of another run, not tried yet
 
 
-@dataclass(frozen=True)
-class _Order:
-    """What a worker is asked for."""
-
-    row: int
-    rung: int  # place among the passes of the ladder, then of the robust one
-    start: Path | None = None  # rollout to draw around
-    start_sha256: str = ""
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What came of it."""
-
-    order: _Order
-    rollout: Rollout
-    certificate: Certificate | None  # of one that passes
-    core_s: float
-    simulated: int  # control steps, of all worlds
-
-
 @dataclass
 class _Session:
     """One session of a search; the workers plan, this process keeps the files."""
@@ -220,7 +185,7 @@ class _Session:
             one.robust_s += spent
         self.env_steps = max(self.env_steps, line["env_steps"])
 
-    def _next(self, busy: set[str]) -> _Order | None:
+    def _next(self, busy: set[str]) -> Order | None:
         """The cheapest rung that is left, of it the motion that came nearest."""
         found = []
         for row, name in enumerate(self.names):
@@ -242,7 +207,7 @@ class _Session:
         rung, _, row = min(found)
         return self._order(row, rung)
 
-    def _order(self, row: int, rung: int) -> _Order:
+    def _order(self, row: int, rung: int) -> Order:
         """A pass, from the nearest miss that is worth it.
 
         The first begins at that of the run before; later ones at the run's own where
@@ -255,9 +220,9 @@ class _Session:
             if line is None or is_unmoved(line) or rung == 0:
                 line = None
         if line is None:
-            return _Order(row, rung)
+            return Order(row, rung)
         path = own_file(self.hold.path, miss_name(name, folder))
-        return _Order(row, rung, path, line["miss_sha256"])
+        return Order(row, rung, path, line["miss_sha256"])
 
     def _end_reason(self) -> str:
         limit = self.recipe.train.wall_limit_s
@@ -280,8 +245,8 @@ class _Session:
             unit="motion",
         )
         provenance = {**self.task.provenance, "run": self.run_id}
-        pool = spawning_pool(count, _open_worker, self._worker_recipe(), provenance)
-        flying: dict[Future[_Found], str] = {}
+        pool = spawning_pool(count, open_worker, self._worker_recipe(), provenance)
+        flying: dict[Future[Found], str] = {}
         try:
             with StopSignals() as stop:
                 while True:
@@ -290,7 +255,7 @@ class _Session:
                         order = self._next(set(flying.values()))
                         if order is None:
                             break
-                        flying[pool.submit(_work, order)] = self.names[order.row]
+                        flying[pool.submit(work, order)] = self.names[order.row]
                     if why or not flying:
                         return why or "nothing left to try"
                     done, _ = wait(flying, WAIT_S, FIRST_COMPLETED)
@@ -313,7 +278,7 @@ class _Session:
         motions = dataclasses.replace(self.recipe.motions, library=library)
         return dataclasses.replace(self.recipe, motions=motions)
 
-    def _take(self, found: _Found, progress: Progress) -> None:
+    def _take(self, found: Found, progress: Progress) -> None:
         """Write what a worker found; the run's clock and counters go on."""
         self.hold.check()
         self.wall_s = time.monotonic() - self._began
@@ -346,107 +311,5 @@ class _Session:
 def _end(pool: ProcessPoolExecutor) -> None:
     """End the workers at once: what they are at is done again after a resume."""
     for process in list((pool._processes or {}).values()):
-        process.terminate()
+        process.kill()  # they ignore what ends the search, and write nothing
     pool.shutdown(wait=True, cancel_futures=True)
-
-
-class _Worker:
-    """Problems of a recipe's motions, in a process of its own."""
-
-    def __init__(self, recipe: SearchRecipe, provenance: dict[str, str]) -> None:
-        self.recipe = recipe
-        self.builder = RunBuilder.from_recipe(recipe, device=torch.device("cpu"))
-        self.layout = SceneLayout.of(self.builder.library)
-        self.limits = ErrorLimits.of(recipe.train.criterion)
-        self.simulator = make_simulator(recipe.search.engine, recipe.physics)
-        # one that waits for its device spends time as well
-        waits = self.simulator is not None
-        self.clock = time.perf_counter if waits else time.process_time
-        self.provenance = provenance
-        self.problem = lru_cache(KEPT)(self._problem)
-
-    def _problem(self, row: int) -> Problem:
-        builder, recipe = self.builder, self.recipe
-        scene = rebuild_scene(
-            builder.library, row, builder.hands, recipe.physics, self.layout, nodes=0
-        )
-        return Problem(
-            builder.bank,
-            builder.hands,
-            StateMap(builder.library, builder.hands, scene),
-            scene,
-            row,
-            env=recipe.env,
-            decimation=recipe.physics.decimation,
-            simulator=self.simulator,
-        )
-
-    def _start(self, order: _Order, problem: Problem) -> NDArray[np.float32] | None:
-        """Actions of the rollout that an order names, until its object is lost."""
-        path = order.start
-        if path is None:
-            return None
-        if hash_content(path, most=MAX_FILE) != order.start_sha256:
-            raise RunError(f"{path}: was changed while the search was at work.")
-        rollout = Rollout.load(path)
-        ctrl = rollout.ctrl[: problem.steps]
-        if ctrl.shape[1] != problem.model.nu or not np.isfinite(ctrl).all():
-            raise RunError(f"{path}: holds no controls of this motion's scene.")
-        poses = rollout.object_pos, rollout.object_quat
-        pos, quat = (x[None, None, : len(ctrl), problem.slots] for x in poses)
-        error = shares(Trial(pos, quat, pos, pos), problem, 0, self.limits).worst[0, 0]
-        near = np.flatnonzero(error <= 1)
-        return problem.residuals(ctrl)[: near.max(initial=0) + 1]
-
-    def work(self, order: _Order) -> _Found:
-        """Plan one motion by one rung, score it, and certify what passes."""
-        begun, search = self.clock(), self.recipe.search
-        problem = self.problem(order.row)
-        before = problem.simulated
-        plan = Planner(
-            problem,
-            search,
-            search.rungs[order.rung],
-            limits=self.limits,
-            grace=grace_steps(self.builder.bank.fps),
-            seed=[self.recipe.seed, order.row, order.rung],
-            start=self._start(order, problem),
-        ).run()
-        episode = Episode(
-            env=0,
-            env_steps=0,
-            steps=problem.play(plan.actions),
-            qpos0=problem.qpos0,
-            qvel0=problem.qvel0,
-            motion=order.row,
-            frame=len(plan.actions),
-            causes={} if plan.is_whole else {"given_up": problem.is_active},
-        )
-        builder = self.builder.rollout_builder(
-            {order.row: problem.scene}, provenance=self.provenance
-        )
-        rollout = builder.build(episode)
-        summary = rollout.summary(self.recipe.train.criterion)
-        certificate = None
-        if summary["converted"] and self.recipe.train.certify:
-            rollout.errors = json.dumps(summary["errors"])
-            certificate = certify(rollout, model=problem.scene.model)
-        spent = self.clock() - begun
-        return _Found(order, rollout, certificate, spent, problem.simulated - before)
-
-
-_worker: list[_Worker] = []  # of this process
-
-
-def _open_worker(recipe: SearchRecipe, provenance: dict[str, str]) -> None:
-    live_with_parent()
-    if recipe.search.engine == "cpu":  # a process a core
-        torch.set_num_threads(1)
-    _worker.append(_Worker(recipe, provenance))
-
-
-def _work(order: _Order) -> _Found:
-    try:
-        return _worker[0].work(order)
-    except FlashdexError as error:
-        raise RunError(str(error)) from None  # others may not travel between processes

@@ -23,7 +23,7 @@ from flashdex.motions.velocities import derive_velocities
 from flashdex.objects.asset import ObjectAsset
 from flashdex.system.arrays import hash_content, write_array
 
-# `world=friendly`: in the default one, nothing of the synthetic library converts at once
+# `world=friendly`: in the default one nothing of these converts at once
 FRIENDLY = {"object_friction": 2.0, "support_friction": 1.0, "torsional_friction": 0.05}
 
 FPS = 60.0

@@ -360,10 +360,10 @@ def world_of(recipe: Line) -> str:
 
 def peaks(facts: list[MotionFacts]) -> dict[str, tuple[float, float]]:
     """Median and maximum over the replays of conversions: mm deep, and N."""
-    proofs = [f.proof for f in facts if f.is_converted]
     found = {}
     for place, name in ((1, "penetration_mm"), (2, "force_n")):
-        known = [proof[place] for proof in proofs if proof[place] is not None]
+        values = [f.proof[place] for f in facts if f.is_converted]
+        known = [value for value in values if value is not None]
         if known:
             found[name] = (median(known), max(known))
     return found

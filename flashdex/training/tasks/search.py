@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from flashdex.errors import RunError
 from flashdex.metrics.tally import is_unmoved, miss_distance
 from flashdex.recipe import SearchRecipe, dump_recipe, expect_kind

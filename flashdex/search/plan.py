@@ -42,6 +42,10 @@ class _Mark:
         """The control step that comes next."""
         return sum(len(actions) for actions in self.done)
 
+    def rank(self) -> tuple[int, float]:
+        """Of what is beyond the limits, or nearly so: farther is better, then nearer."""
+        return self.step, -float(self.total.max())
+
 
 def closing_directions(hand: HandSpec) -> Array:
     """How much each joint takes part when all fingers close, (J,) in [-1, 1].
@@ -194,18 +198,26 @@ class Planner:
             self._knots.copy(),
         )
         marks, retries, depth, until = [at], rung.retries, 0, 0
+        left: list[_Mark] = []  # where it went back, but might have gone on
+        over: list[_Mark] = []  # where it was beyond the limits
         while at.step < problem.steps:
             self._effort = EFFORT if at.step < until else 1.0
             at, error = self._advance(at)
             is_over = at.total.max() > problem.steps - self.grace
             if (is_over or error > self.config.lost) and retries:
+                (over if is_over else left).append(at)
                 # deeper each time that it gets no further
                 depth = depth + 1 if at.step <= until else 1
                 retries, until = retries - 1, max(until, at.step)
                 marks = marks[: max(1, len(marks) - BACK - depth)]
                 at = marks[-1]
                 self._knots = at.knots.copy()
+            elif is_over and left:
+                over.append(at)
+                at, left = max(left, key=_Mark.rank), []
+                self._knots = at.knots.copy()
             elif is_over:
+                at = max([*over, at], key=_Mark.rank)
                 break
             else:
                 marks.append(at)

@@ -4,7 +4,8 @@
     python -m benchmarks.choose_motions libraries/myodm scores.json --count 50
 
 The rule: a motion is eligible when neither an object that never moves (frozen_object)
-nor a hand that holds still (do_nothing) passes it by any criterion. Of the eligible
+nor a hand that holds still (do_nothing) passes it by any criterion, and the reference
+played back does not by the usual one (sr_mt_obj). Of the eligible
 ones those are taken whose recording is cleanest, that is, whose human fingertips are
 least deep inside the object; equal depths in name order. Prints a YAML list.
 """
@@ -17,6 +18,7 @@ import json
 from pathlib import Path
 
 TRIVIAL = ("do_nothing", "frozen_object")
+PLAYBACK, USUAL = "kinematic_playback", "sr_mt_obj"
 DEPTH = "human_tip_depth_mm"
 
 
@@ -32,6 +34,7 @@ def choose(
         for row in report
         if row["status"] != "rejected"
         and not any(scores[name][row["motion"]]["passed"] for name in TRIVIAL)
+        and USUAL not in scores[PLAYBACK][row["motion"]]["passed"]
     ]
     eligible.sort(key=lambda row: (float(row[DEPTH]), row["motion"]))
     return sorted(row["motion"] for row in eligible[:count]), len(eligible)

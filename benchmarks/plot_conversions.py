@@ -23,7 +23,7 @@ STYLE = (
 
 def curve(name: str, summary: dict) -> Series:
     """Motions converted by when, core-minutes, to the end of the run."""
-    cores = int(re.search(r"(\d+) cores", summary["hardware"])[1])
+    cores = int(re.findall(r"(\d+) cores", summary["hardware"])[0])
     end = summary.get("core_s") or 60 * cores * summary["minutes"]
     spent = sorted(
         found.get("core_s") or cores * found["wall_s"]

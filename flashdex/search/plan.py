@@ -43,7 +43,7 @@ class _Mark:
         return sum(len(actions) for actions in self.done)
 
     def rank(self) -> tuple[int, float]:
-        """Of what is beyond the limits, or nearly so: farther is better, then nearer."""
+        """Of what is beyond the limits, or nearly: farther on first, then nearer."""
         return self.step, -float(self.total.max())
 
 
@@ -166,7 +166,7 @@ class Planner:
     ) -> Costs:
         """Costs of N sequences; only those that do well nominally are perturbed."""
 
-        def found(worlds: Worlds, some: Array) -> Costs:
+        def found(worlds: Worlds, some: NDArray[np.intp]) -> Costs:
             trial = self.problem.simulate(worlds, actions[some], first)
             given = (knots[some], self._noise, self.problem, self.config)
             return cost(trial, *given, first, self.limits)

@@ -47,7 +47,7 @@ def main() -> None:
     total = max(summary["motions"] for _, summary in found)
     chart = line_chart(
         [curve(label, summary) for label, summary in found],
-        title="Converted motions",
+        title="Motions",
         x_label="core-minutes",
         is_step=True,
         y_range=(0.0, float(total)),

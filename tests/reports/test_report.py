@@ -37,8 +37,11 @@ def test_headline_and_header(run_dir):
         "converted": "1/5",  # five motions by the rate, three of them tried
         "certified": "1/1",
         "robust": "1/1",
+        "strict": "1/1",
         "and trivial": "0",
         "attempts": "7",
+        "deepest mm, median / max": "3.7 / 3.7",
+        "force N, median / max": "12.4 / 12.4",
     }
     facts = header(text)
     assert facts["recipe"] == "tiny"
@@ -70,7 +73,8 @@ def test_trivial_conversions_are_counted_apart_everywhere(run_dir, kind, table_r
     assert found["certified"] == found["robust"] == "0/0"
     assert table_rows(page)[0]["motion"] == "push trivial"
     said = run_table(run_dir)
-    assert "0 of 5 converted by sr_mt_obj, 0 certified (0 robust), and 1 triv" in said
+    assert "0 of 5 converted by sr_mt_obj, 0 certified (0 robust, 0 strict)" in said
+    assert "and 1 trivial" in said
 
 
 def test_row_of_a_conversion(run_dir, certificate, table_rows):

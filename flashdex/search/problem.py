@@ -199,7 +199,7 @@ class Problem:
         for k in range(1, count):
             rng = np.random.default_rng([_DRAWS, k])
             model, qpos = worst_case(
-                self.model, self.qpos0, self._bodies, self.adr, k, seed=_DRAWS
+                self.model, self.qpos0, self._bodies, self.adr, k - 1, seed=_DRAWS
             )
             width = control_range(model, self.controls(self._still(), 0)[0])
             noise[k] = rng.normal(size=noise[k].shape) * PERTURBATION.ctrl_noise * width

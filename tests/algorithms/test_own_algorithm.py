@@ -107,7 +107,8 @@ def recipe_file(library, tmp_path):
 total_env_steps: 80
 run_dir: {tmp_path / "run"}
 motions: {{library: {library.path}, control_hz: {library.fps}}}
-physics: {{num_threads: 1, timestep: {1 / library.fps / 4}, decimation: 4}}
+physics: {{num_threads: 1, timestep: {1 / library.fps / 4}, decimation: 4,
+  object_friction: 2.0}}
 env: {{num_envs: 4, attempt_share: 0.5, finger_mode: residual}}
 algo: {{kind: hill, spread: 0.2, buffer_size: 1000, batch_size: 32, critic_width: 16}}
 train: {{certify: false, render_conversions: false}}

@@ -67,6 +67,10 @@ def _hand_friction(model: mujoco.MjModel) -> None:
     model.geom_friction[:-1, 0] *= 0.5
 
 
+def _torsion(model: mujoco.MjModel) -> None:
+    model.geom_friction[:, 1] *= 0.5  # of a pair the larger counts
+
+
 def _sliding_only(model: mujoco.MjModel) -> None:
     model.geom_condim[-1] = 3
 
@@ -120,7 +124,7 @@ FINE_MUTATIONS: dict[str, tuple[str, Edit]] = {
     "mass 10 % more, gripped": ("grip", box("body_mass", 1.1)),
     "mass 10 % more, lying": ("cradle", box("body_mass", 1.1)),
     "friction halved, twirling": ("twirl", box("geom_friction", 0.5, 0)),
-    "torsional friction halved": ("grip", box("geom_friction", 0.5, 1)),
+    "torsional friction halved": ("grip", _torsion),
     "contacts 10 % slower": ("slide", scaled("geom_solref", 1.1)),
     "random play, gravity 1 % more": ("random", _gravity),
 }

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import torch
 from reduced import reduced_library
+from synthetic import FRIENDLY
 
 from flashdex import keys
 from flashdex.envs.physics.brax.engine import BraxPhysics, refuse_unlike_objects
@@ -34,7 +35,7 @@ def reduced(tmp_path_factory, hands):
 @pytest.fixture(scope="module")
 def engines(reduced, hands):
     """Both engines, four worlds each; every test resets all of them."""
-    config = PhysicsConfig(num_threads=1)
+    config = PhysicsConfig(num_threads=1, **FRIENDLY)
     build = (BraxPhysics, CpuPhysics)
     return tuple(engine(reduced, hands, config, N) for engine in build)
 

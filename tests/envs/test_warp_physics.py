@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from no_sync import forbid_sync
+from synthetic import FRIENDLY
 
 from flashdex import keys
 from flashdex.envs.scene.wrench import ObjectWrench
@@ -25,7 +26,9 @@ def make_warp(library, hands):
     from flashdex.envs.physics.warp.engine import WarpPhysics
 
     def make(num_envs, **fields):
-        return WarpPhysics(library, hands, PhysicsConfig(**fields), num_envs)
+        return WarpPhysics(
+            library, hands, PhysicsConfig(**FRIENDLY, **fields), num_envs
+        )
 
     return make
 
@@ -100,7 +103,8 @@ def cpu_like(library, hands):
     from flashdex.envs.physics.cpu import CpuPhysics
 
     def make(num_envs):
-        return CpuPhysics(library, hands, PhysicsConfig(num_threads=1), num_envs)
+        config = PhysicsConfig(num_threads=1, **FRIENDLY)
+        return CpuPhysics(library, hands, config, num_envs)
 
     return make
 

@@ -10,9 +10,10 @@ import pytest
 
 from flashdex.envs.physics.config import PhysicsConfig
 from flashdex.envs.physics.warp.rollout import WarpRollout
+from flashdex.envs.scene.perturbation import perturb_model
 from flashdex.errors import FlashdexError
 from flashdex.search.config import Rung, SearchConfig
-from flashdex.search.simulate import Warp, Worlds
+from flashdex.search.simulate import BATCHES, Warp, Worlds
 
 pytest.importorskip("mujoco_warp")
 STEPS = 8
@@ -27,6 +28,12 @@ def draw_controls(problem, count=4):
     rng = np.random.default_rng(0)
     shape = (count, STEPS, len(problem.active), problem.num_joints)
     return problem.controls(problem.spread(rng.uniform(-0.5, 0.5, shape)), 0)
+
+
+def only(batches):
+    """The one there is."""
+    (batch,) = batches.values()
+    return batch
 
 
 def both(warp, problem, worlds, ctrl, first=0):
@@ -45,7 +52,8 @@ def test_worlds_go_where_mujoco_c_says(make_problem, warp, name):
     error = np.abs(got[0] - wanted[0])
     np.testing.assert_allclose(error[..., 0], 0, atol=1e-7)  # time
     qpos = error[..., 1 : 1 + problem.model.nq].max(-1)
-    assert np.median(qpos) < 5e-5  # m, rad
+    for k, median in enumerate((5e-5, 1e-3, 1e-3)):  # contacts begin at corners
+        assert np.median(qpos[:, k]) < median  # m, rad
     assert qpos.max() < 0.05
     tips = np.abs(got[1] - wanted[1])
     assert np.median(tips.max(-1)) < 1e-4  # m
@@ -56,8 +64,10 @@ def test_masses_and_friction_are_those_of_each_world(make_problem, warp):
     """From one state, under the same controls: what differs is the models."""
     problem = make_problem("right_box")
     worlds = problem.worlds(3)
+    random = np.random.default_rng(5)
+    models = [*worlds.models[:2], perturb_model(problem.model, problem._bodies, random)]
     alike = Worlds(
-        worlds.models, np.tile(worlds.states[:1], (3, 1)), np.zeros_like(worlds.noise)
+        models, np.tile(worlds.states[:1], (3, 1)), np.zeros_like(worlds.noise)
     )
     (got, _), (wanted, _) = both(warp, problem, alike, draw_controls(problem))
     columns = 1 + problem.adr[0] + np.arange(3)
@@ -76,20 +86,22 @@ def test_a_recorded_step_gives_what_a_launched_one_gives(make_problem):
     first = warp(worlds, ctrl, 0)
     warp(worlds, ctrl[::-1].copy(), 0)
     again = warp(worlds, ctrl, 0)
-    assert warp._batch._step._graph is not None
+    assert only(warp._batches)._step._graph is not None
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_worlds_are_gone_when_others_are_asked_for(make_problem):
-    """At once, not when the collector comes by: a device has no room for both."""
+def test_worlds_are_gone_when_many_others_are_asked_for(make_problem):
+    """At once, not when the collector comes by: a device has no room for all."""
     problem, warp = make_problem("right_box"), Warp(PhysicsConfig())
-    worlds, ctrl = problem.worlds(1), draw_controls(problem, count=3)[:, :1]
+    worlds, ctrl = problem.worlds(1), draw_controls(problem, count=BATCHES + 1)[:, :1]
     warp(worlds, ctrl, 0)
-    before = weakref.ref(warp._batch)
+    before = weakref.ref(only(warp._batches))
     gc.disable()
     try:
-        warp(worlds, ctrl[:2], 0)
+        for count in range(BATCHES, 0, -1):
+            assert before() is not None
+            warp(worlds, ctrl[:count], 0)
     finally:
         gc.enable()
     assert before() is None
@@ -143,7 +155,7 @@ def test_samples_that_do_not_fit_are_played_in_turn(make_problem, warp, monkeypa
     few = Warp(PhysicsConfig())
     for a, b in zip(few(worlds, ctrl, 0), wanted, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4, rtol=1e-4)
-    assert few._batch.count == 2
+    assert only(few._batches).count == 2
     monkeypatch.setattr(WarpRollout, "_put", nothing_fits)
     with pytest.raises(FlashdexError, match="do not fit"):
         Warp(PhysicsConfig())(worlds, ctrl, 0)

@@ -12,6 +12,7 @@ from pathlib import Path
 from subprocess import PIPE, Popen
 
 import pytest
+from synthetic import FRIENDLY
 
 from flashdex.cli.main import main
 from flashdex.envs.physics.config import PhysicsConfig
@@ -47,7 +48,7 @@ def recipe(library, tmp_path):
             total_env_steps=10**6,
             run_dir=str(tmp_path / "run"),
             motions=MotionsConfig(library=str(library.path)),
-            physics=PhysicsConfig(num_threads=1),
+            physics=PhysicsConfig(num_threads=1, **FRIENDLY),
             search=LADDERS,
             logger=LoggerConfig(),
         )
@@ -242,7 +243,7 @@ def test_samples_of_warp_become_conversions_of_mujoco_c(recipe, inline):
     few = dataclasses.replace(LADDERS, samples_factor=1, robust_ladder=[], workers=0)
     recipe = dataclasses.replace(
         only(recipe, "right_box"),
-        physics=PhysicsConfig(engine="warp", num_threads=1),
+        physics=PhysicsConfig(engine="warp", num_threads=1, **FRIENDLY),
         search=few,
     )
     run = search(recipe)

@@ -12,7 +12,7 @@ SPEED = "convert/per_hour"  # of a clock that went on between two readings
 SPEED_TOLERANCE = 0.05
 UNMOVED = "moves_too_little"  # reason for a trivial conversion, beside baselines
 # of a motion's first pass, what a better proof of a later one replaces
-NEWEST = ("certified", "verdict", "survived")
+NEWEST = ("certified", "verdict", "survived", "rollout_sha256", "certificate_sha256")
 
 NEARER = 0.9  # of its distance an attempt may have to replace a nearest miss
 

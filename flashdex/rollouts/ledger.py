@@ -155,8 +155,8 @@ class Ledger(Tally):
         Args:
             rollout: of the attempt.
             wall_s: seconds of the run so far.
-            is_own: it was made here; a model that was found in a file is tried in a
-                child process first.
+            is_own: it was made here; else it was found in its file, which wants a line,
+                and its model is tried in a child process first.
             certificate: of the rollout, where it has been made already; where more
                 perturbed replays pass, it replaces the one before.
 
@@ -179,7 +179,8 @@ class Ledger(Tally):
         # One lucky draw is not the last word: later passes may still be proven, but not
         # by one in which the object moves less.
         is_wanted = (
-            before is None
+            not is_own  # it stands there: what it has replaced is gone
+            or before is None
             or self.moves_more(line, before)
             or (
                 self.certify
@@ -190,7 +191,9 @@ class Ledger(Tally):
         if line["converted"] and is_wanted:
             rollout.errors = json.dumps(line["errors"])
             if certificate is None and self.certify:
-                certificate = _prove(rollout, is_own=is_own)
+                xml = rollout.model_xml
+                model = mujoco.MjModel.from_xml_string(xml) if is_own else None
+                certificate = prove(rollout, model)
             line.update(self._store(rollout, certificate))
         elif not (self.is_done(name) or line["converted"]) and is_nearer(
             line, self.misses.get(name)
@@ -329,10 +332,12 @@ COUNTERS = ("env_steps", "frame", "seed", "wall_s")
 ROUNDED = 1e-6  # m or rad, of the values in a line
 
 
-def _prove(rollout: Rollout, *, is_own: bool) -> Certificate | None:
+def prove(rollout: Rollout, model: mujoco.MjModel | None) -> Certificate | None:
+    """The certificate of a rollout; None, and a word in the log, where it has none.
+
+    ``model`` is that of the rollout where somebody made it here, see ``certify``.
+    """
     try:
-        xml = rollout.model_xml
-        model = mujoco.MjModel.from_xml_string(xml) if is_own else None
         return certify(rollout, model=model)
     except (FlashdexError, ValueError) as error:
         if is_of_machine(error):

@@ -16,7 +16,9 @@ from flashdex.search.costs import Costs, ErrorLimits, cost, shares
 from flashdex.search.problem import Problem, Worlds
 
 Array = NDArray[np.float64]
-BACK = 2  # strides gone back at least, with what was lost in, where an object is lost
+# strides gone back from the one in which an object is lost, and one more each time that
+# it gets no further
+BACK = 2
 EFFORT = 2.0  # factor of samples there, and of the noise squared
 
 

@@ -101,6 +101,7 @@ class Problem:
         self._simulator = simulator or self._truth
         self.ref_tips = self._reference_tips(ref["joint_pos"])
         self.simulated = 0  # control steps so far
+        self._worlds: dict[int, Worlds] = {}  # by their number
 
     def _planning_model(self) -> mujoco.MjModel:
         spec = mujoco.MjSpec.from_string(self.scene.xml)
@@ -194,6 +195,11 @@ class Problem:
 
     def worlds(self, count: int) -> Worlds:
         """The nominal world and ``count - 1`` perturbed ones, always the same."""
+        if count not in self._worlds:  # what plays them may keep them on its device
+            self._worlds[count] = self._make_worlds(count)
+        return self._worlds[count]
+
+    def _make_worlds(self, count: int) -> Worlds:
         models, states = [self.model], [self._full_state(self.model, self.qpos0)]
         noise = np.zeros((count, self.steps, self.model.nu))
         for k in range(1, count):

@@ -418,6 +418,22 @@ def test_a_miss_that_is_not_as_it_was_stored_is_found(missed_run, tmp_path, dama
     assert not is_changed or any("miss_sha256" in text for text in found)
 
 
+def test_a_better_plan_whose_line_a_crash_has_cost_gets_one(orphan, converted_run):
+    """The one before it is gone; the run says so once, and names the file there is."""
+    run, reopen = orphan
+    (line,) = read_lines(converted_run / CONVERSIONS)
+    before = {"rollout_sha256": "0" * 64, "verdict": "certified", "survived": 0.5}
+    append_line(run / CONVERSIONS, line | before | {"env_steps": 0})
+    assert reopen().adopt(wall_s=9.0) == ["right_box"]
+    assert reopen().adopt(wall_s=9.0) == []
+    _, last = read_lines(run / CONVERSIONS)
+    assert last["rollout_sha256"] == line["rollout_sha256"]
+    assert last["verdict"] == "robust"
+    told = reopen().conversions["right_box"]
+    assert told["rollout_sha256"] == line["rollout_sha256"]
+    assert (told["env_steps"], told["survived"]) == (0, last["survived"])
+
+
 DAMAGES = {
     "empty": lambda path: path.write_bytes(b""),
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),

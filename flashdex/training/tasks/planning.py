@@ -17,7 +17,8 @@ from flashdex.envs.scene.scene import SceneLayout, rebuild_scene
 from flashdex.errors import FlashdexError, RunError
 from flashdex.recipe import SearchRecipe
 from flashdex.rollouts.build import grace_steps
-from flashdex.rollouts.certificate import Certificate, certify
+from flashdex.rollouts.certificate import Certificate
+from flashdex.rollouts.ledger import prove
 from flashdex.rollouts.recorder import Episode
 from flashdex.rollouts.rollout import MAX_FILE, Rollout
 from flashdex.rollouts.scorer import live_with_parent
@@ -132,7 +133,7 @@ class Worker:
         certificate = None
         if summary["converted"] and self.recipe.train.certify:
             rollout.errors = json.dumps(summary["errors"])
-            certificate = certify(rollout, model=problem.scene.model)
+            certificate = prove(rollout, problem.scene.model)
         spent = self.clock() - begun
         return Found(order, rollout, certificate, spent, problem.simulated - before)
 

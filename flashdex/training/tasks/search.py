@@ -200,8 +200,11 @@ class _Session:
             else:
                 rung, last = max(one.rung + 1, self.search.num_plain), len(self.rungs)
                 near = (False, False, -(before.get("survived") or 0.0))
-                spent = one.robust_s >= self.search.robust_budget_s
-                spent = spent or before.get("verdict") == "robust"
+                spent = (
+                    one.robust_s >= self.search.robust_budget_s
+                    or before.get("verdict") == "robust"
+                    or not self.recipe.train.certify  # then no proof tells plans apart
+                )
             if rung < last and not spent:
                 found.append((rung, near, row))
         if not found:
@@ -228,8 +231,6 @@ class _Session:
 
     def _end_reason(self) -> str:
         limit = self.recipe.train.wall_limit_s
-        if self.env_steps >= self.recipe.total_env_steps:
-            return "budget"
         if limit is not None and self.wall_s > limit:
             return "wall_limit_s"
         return ""

@@ -18,7 +18,7 @@ from flashdex.rollouts.findings import differences
 from flashdex.rollouts.ledger import CONVERSIONS, check_line, read_ledger
 from flashdex.rollouts.rollout import MAX_FILE
 from flashdex.system.arrays import hash_content
-from flashdex.system.files import open_own, own_file, own_folder, remove_own
+from flashdex.system.files import open_own, own_file, own_files, own_folder, remove_own
 from flashdex.system.jsonl import check_keys, read_object, write_object
 from flashdex.system.run_files import MOTIONS, SOURCE, STARTS, miss_name, run_id
 from flashdex.training.run_dir import load_run_recipe
@@ -77,7 +77,8 @@ def read_source(source: Path, recipe: Recipe, contents: Mapping[str, str]) -> So
     tally = Tally(names, recipe.train.criterion, lines)
     misses: dict[str, dict[str, Any]] = {}
     for line in lines:
-        follow_misses(misses, line)
+        if line["criterion"] == recipe.train.criterion:
+            follow_misses(misses, line)
     done = {name: tally.conversions[name] for name in tally.done}
     return Source(
         run_id(source),
@@ -127,21 +128,27 @@ def take_over(source: Path, found: Source, run_dir: Path) -> None:
     """
     own_folder(run_dir, STARTS)
     for motion, line in found.starts.items():
-        path = own_file(source, miss_name(motion))
-        if not _is_file_of(line, path):
+        path, copy = own_file(source, miss_name(motion)), miss_name(motion, STARTS)
+        is_copied = _is_file_of(line, path)
+        if is_copied:
+            with open_own(run_dir, copy) as file:
+                file.write(path.read_bytes())
+            # a run that goes on may have replaced it in between
+            is_copied = _is_file_of(line, own_file(run_dir, copy))
+        if not is_copied:
             raise RunError(
                 f"{path}: is missing, or not the file that its line in {CONVERSIONS} "
                 f"names; 'flashdex verify {source}' tells more. While that run goes "
                 "on, try again."
             )
-        with open_own(run_dir, miss_name(motion, STARTS)) as file:
-            file.write(path.read_bytes())
     write_object(dataclasses.asdict(found), run_dir, SOURCE)
 
 
 def forget_source(run_dir: Path) -> None:
     """Remove what a search that never began has left in its folder."""
     remove_own(run_dir, SOURCE)
+    for path in own_files(run_dir, STARTS, "*.npz"):
+        path.unlink()
 
 
 def _is_file_of(line: Mapping[str, Any], path: Path) -> bool:

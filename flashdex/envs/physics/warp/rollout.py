@@ -29,6 +29,8 @@ _log = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
+NO_ROOM = ("memory", "allocat")  # of what Warp and CUDA say where there is none
+
 
 class NoRoomError(FlashdexError):
     """Worlds that the device has no memory for."""
@@ -65,6 +67,9 @@ class WarpRollout:
             self._step = Recorded(launch, self.device)
             self._step()  # asks for the memory of a step
         except (RuntimeError, MemoryError) as error:
+            told = str(error).lower()
+            if isinstance(error, RuntimeError) and not any(x in told for x in NO_ROOM):
+                raise
             raise NoRoomError(
                 f"physics=warp: {count * len(models)} worlds do not fit on "
                 f"{self._name} ({error})"

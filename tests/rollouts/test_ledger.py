@@ -421,7 +421,8 @@ def test_a_miss_that_is_not_as_it_was_stored_is_found(missed_run, tmp_path, dama
 def test_a_better_plan_whose_line_a_crash_has_cost_gets_one(orphan, converted_run):
     """The one before it is gone; the run says so once, and names the file there is."""
     run, reopen = orphan
-    (line,) = read_lines(converted_run / CONVERSIONS)
+    lines = read_lines(converted_run / CONVERSIONS)
+    (line,) = [x for x in lines if x.get("rollout") and x["motion"] == "right_box"]
     before = {"rollout_sha256": "0" * 64, "verdict": "certified", "survived": 0.5}
     append_line(run / CONVERSIONS, line | before | {"env_steps": 0})
     assert reopen().adopt(wall_s=9.0) == ["right_box"]

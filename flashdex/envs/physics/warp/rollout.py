@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 
-NO_ROOM = ("memory", "allocat")  # of what Warp and CUDA say where there is none
+NO_ROOM = ("memory", "alloc")  # of what Warp and CUDA say where there is none
 
 
 class NoRoomError(FlashdexError):

@@ -87,6 +87,7 @@ class Tally:
         # motion -> line of its first pass, with the newest verdict
         self.conversions: dict[str, Line] = {}
         self.last: dict[str, bool] = {}  # motion -> whether its newest attempt passed
+        self.misses: dict[str, Line] = {}  # motion -> line of its nearest miss
         # motion -> lines
         self.attempts: dict[str, int] = dict.fromkeys(self.names, 0)
         for line in lines:  # a resume may ask for another criterion, or fewer motions
@@ -96,6 +97,7 @@ class Tally:
     def count(self, line: Line) -> bool:
         """Count a line that is in the file; is the motion done by it?"""
         name = line["motion"]
+        follow_misses(self.misses, line)
         self.attempts[name] = self.attempts.get(name, 0) + 1
         self.last[name] = line["converted"]
         before, was_done = self.conversions.get(name), self.is_done(name)

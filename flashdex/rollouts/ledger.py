@@ -19,7 +19,6 @@ from flashdex.metrics.criteria_table import limits_of
 from flashdex.metrics.tally import (
     UNMOVED,
     Tally,
-    follow_misses,
     is_nearer,
     is_unmoved,
 )
@@ -133,13 +132,9 @@ class Ledger(Tally):
         drop_cut_line(self.path)
         lines = read_ledger(self.path)  # of earlier sessions
         super().__init__(names, criterion, lines)
-        self.core_s = float(lines[-1].get("core_s", 0.0)) if lines else 0.0
-        # motion -> line of its nearest miss, where the file is the one that it names
-        self.misses: dict[str, dict[str, Any]] = {}
-        for line in lines:
-            follow_misses(self.misses, line)
+        self.newest: dict[str, Any] = lines[-1] if lines else {}
         for name, line in list(self.misses.items()):
-            if line["criterion"] != criterion or not self._has_miss(name, line):
+            if not self._has_miss(name, line):  # whose file is not the one it names
                 del self.misses[name]
 
     def record(
@@ -175,19 +170,8 @@ class Ledger(Tally):
             **self._spent(rollout),
             "trivial": self._trivial(rollout),
         }
-        before = self.conversions.get(name)
-        # One lucky draw is not the last word: later passes may still be proven, but not
-        # by one in which the object moves less.
-        is_wanted = (
-            not is_own  # it stands there: what it has replaced is gone
-            or before is None
-            or self.moves_more(line, before)
-            or (
-                self.certify
-                and not self.moves_more(before, line)
-                and (not before["certified"] or _is_better(certificate, before))
-            )
-        )
+        # one that stands there is wanted: what it has replaced is gone
+        is_wanted = not is_own or self._is_wanted(line, certificate)
         if line["converted"] and is_wanted:
             rollout.errors = json.dumps(line["errors"])
             if certificate is None and self.certify:
@@ -200,12 +184,24 @@ class Ledger(Tally):
         ):
             line.update(self._keep(rollout, line))
         append_line(self.path, line)
-        self.core_s = line.get("core_s", self.core_s)
-        follow_misses(self.misses, line)
+        self.newest = line
         is_done = self.count(line)
         if is_done:
             remove_own(self.run_dir, miss_name(name))
         return line, is_done
+
+    def _is_wanted(self, line: dict[str, Any], certificate: Certificate | None) -> bool:
+        """Whether a pass is stored: the first one, or one that proves or moves more.
+
+        One lucky draw is not the last word: later passes may still be proven, but not
+        by one in which the object moves less.
+        """
+        before = self.conversions.get(line["motion"])
+        if before is None or self.moves_more(line, before):
+            return True
+        if not self.certify or self.moves_more(before, line):
+            return False
+        return not before["certified"] or _is_better(certificate, before)
 
     def _spent(self, rollout: Rollout) -> dict[str, Any]:
         """What an attempt of a search says that it cost, and the run with it.
@@ -218,7 +214,8 @@ class Ledger(Tally):
         said = json.loads(rollout.provenance).get(OF_SEARCH)
         if not is_search_part(said):
             raise RunError(f"{rollout.motion}: does not say what its search cost.")
-        return {**said, "core_s": round(self.core_s + said["attempt_s"], 3)}
+        core_s = self.newest.get("core_s", 0.0) + said["attempt_s"]
+        return {**said, "core_s": round(core_s, 3)}
 
     def _has_miss(self, name: str, line: dict[str, Any]) -> bool:
         path = own_file(self.run_dir, miss_name(name))

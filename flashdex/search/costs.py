@@ -50,11 +50,16 @@ class ErrorLimits:
         )
 
 
-def shares(trial: Trial, problem: Problem, first: int, limits: ErrorLimits) -> Shares:
-    """Errors from control step ``first`` on; a state that is not finite is far off."""
-    steps = slice(first, first + trial.object_pos.shape[2])
-    pos = np.linalg.norm(trial.object_pos - problem.ref_pos[steps], axis=-1)
-    dot = np.abs((trial.object_quat * problem.ref_quat[steps]).sum(-1)).clip(0, 1)
+def shares(
+    pos: Array, quat: Array, problem: Problem, first: int, limits: ErrorLimits
+) -> Shares:
+    """Errors of objects at pos, quat (N, K, H, O, .) from control step ``first`` on.
+
+    A state that is not finite is far off.
+    """
+    steps = slice(first, first + pos.shape[2])
+    pos = np.linalg.norm(pos - problem.ref_pos[steps], axis=-1)
+    dot = np.abs((quat * problem.ref_quat[steps]).sum(-1)).clip(0, 1)
     return Shares(
         np.nan_to_num(pos / limits.pos, nan=100.0, posinf=100.0),
         np.nan_to_num(2 * np.arccos(dot) / limits.rot, nan=LOST),
@@ -93,7 +98,7 @@ def cost(
         first: control step that the sequences begin at.
         limits: of the criterion.
     """
-    found = shares(trial, problem, first, limits)
+    found = shares(trial.object_pos, trial.object_quat, problem, first, limits)
     steps = found.pos.shape[2]
     weight = np.ones(steps)
     if first + steps < problem.steps:

@@ -96,7 +96,6 @@ class Planner:
     ) -> None:
         self.problem, self.config, self.rung = problem, config, rung
         self.limits, self.grace = limits, grace
-        self._effort = 1.0  # factor of samples, and of the noise squared
         self._rng = np.random.default_rng(seed)
         count = problem.steps // config.knot + 2
         steps = np.arange(problem.steps) / config.knot
@@ -139,7 +138,9 @@ class Planner:
         own = mixed(*shape) * self._noise
         return own + mixed(shape[0], 1) * self._closing
 
-    def _window(self, worlds: Worlds, first: int, stop: int) -> NDArray[np.float32]:
+    def _window(
+        self, worlds: Worlds, first: int, stop: int, effort: float
+    ) -> NDArray[np.float32]:
         """Anneal the knots of steps ``first`` to ``stop``; the best actions there."""
         problem, config, rung = self.problem, self.config, self.rung
         used = np.flatnonzero(self._basis[first:stop].any(0))
@@ -147,8 +148,8 @@ class Planner:
         best = middle = self._knots[used]
         lowest = np.inf
         for turn in range(rung.rounds):
-            noise = self._draw(round(rung.samples * self._effort), len(used))
-            noise *= config.anneal**turn * self._effort**0.5
+            noise = self._draw(round(rung.samples * effort), len(used))
+            noise *= config.anneal**turn * effort**0.5
             tried = middle + noise
             tried[0], tried[1] = middle, best
             tried = tried.clip(-1, 1)
@@ -203,8 +204,7 @@ class Planner:
         left: list[_Mark] = []  # where it went back, but might have gone on
         over: list[_Mark] = []  # where it was beyond the limits
         while at.step < problem.steps:
-            self._effort = EFFORT if at.step < until else 1.0
-            at, error = self._advance(at)
+            at, error = self._advance(at, EFFORT if at.step < until else 1.0)
             is_over = at.total.max() > problem.steps - self.grace
             if (is_over or error > self.config.lost) and retries:
                 (over if is_over else left).append(at)
@@ -225,13 +225,17 @@ class Planner:
                 marks.append(at)
         return Plan(np.concatenate(at.done), at.step >= problem.steps)
 
-    def _advance(self, at: _Mark) -> tuple[_Mark, float]:
-        """Decide the next stride and play it; the mean error in it, in limits."""
+    def _advance(self, at: _Mark, effort: float) -> tuple[_Mark, float]:
+        """Decide the next stride and play it; the mean error in it, in limits.
+
+        ``effort`` is a factor of the samples, and of their noise squared.
+        """
         problem, first = self.problem, at.step
         stop = min(problem.steps, first + self.rung.horizon)
-        actions = self._window(at.worlds, first, stop)[: self.config.stride]
+        actions = self._window(at.worlds, first, stop, effort)[: self.config.stride]
         trial = problem.simulate(at.worlds, actions[None], first)
-        found = shares(trial, problem, first, self.limits)
+        pose = trial.object_pos, trial.object_quat
+        found = shares(*pose, problem, first, self.limits)
         scored = slice(max(0, self.grace - first), None)
         total = at.total + np.stack(
             [errors[0, 0, scored].sum(0) for errors in (found.pos, found.rot)]

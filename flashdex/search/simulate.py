@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -130,11 +131,9 @@ class Warp:
     @property
     def overflow(self) -> dict[str, int]:
         """Worlds on the device that have run out of room, by kind."""
-        found: dict[str, int] = {}
-        for batch in self._batches.values():
-            for kind, count in batch.overflow.items():
-                found[kind] = found.get(kind, 0) + count
-        return found
+        return dict(
+            sum((Counter(b.overflow) for b in self._batches.values()), Counter())
+        )
 
 
 def make_simulator(engine: SampleEngine, physics: PhysicsConfig) -> Simulator | None:

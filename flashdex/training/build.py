@@ -125,7 +125,8 @@ def select_motions(library: MotionLibrary, recipe: Recipe) -> MotionLibrary:
             rows = [i for i, n in enumerate(library.names) if is_named(n, pattern)]
             missing += [] if rows else [pattern]
             chosen += [r for r in rows if r not in chosen]
-        if missing and len(chosen) < (recipe.motions.count or len(library.names) + 1):
+        count = recipe.motions.count
+        if missing and (count is None or len(chosen) < count):
             raise LibraryError(
                 f"{library.path}: motions.select '{missing[0]}' matches none of "
                 f"{', '.join(library.names)}."

@@ -70,7 +70,9 @@ def test_a_pass_goes_back_where_it_loses_an_object(make_problem):
 
     def error(actions):
         trial = problem.simulate(problem.worlds(1), actions[None, : len(once.actions)])
-        return shares(trial, problem, 0, strict).worst.mean()
+        return shares(
+            trial.object_pos, trial.object_quat, problem, 0, strict
+        ).worst.mean()
 
     assert error(found.actions) < 0.8 * error(once.actions)
 
@@ -92,7 +94,7 @@ def test_more_samples_come_closer(make_problem):
 
     def error(actions):
         trial = problem.simulate(problem.worlds(1), actions[None])
-        found = shares(trial, problem, 0, LIMITS)
+        found = shares(trial.object_pos, trial.object_quat, problem, 0, LIMITS)
         return (found.pos + found.rot).mean()
 
     still = np.zeros((problem.steps, 2, problem.num_joints), np.float32)

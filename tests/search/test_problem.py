@@ -116,10 +116,18 @@ def test_shares_are_errors_over_limits(make_problem):
     for t in range(problem.steps):
         mujoco.mju_mulQuat(out, problem.ref_quat[t, 0], turn)
         trial.object_quat[0, 0, t, 0] = out
-    found = shares(trial, problem, 0, ErrorLimits.of("sr_mt_obj"))
+    found = shares(
+        trial.object_pos, trial.object_quat, problem, 0, ErrorLimits.of("sr_mt_obj")
+    )
     np.testing.assert_allclose(found.pos, 0.5, atol=1e-5)
     np.testing.assert_allclose(found.rot, 0.5, atol=1e-5)
-    strict = shares(trial, problem, 0, ErrorLimits.of("sr_mt_obj_x0.5"))
+    strict = shares(
+        trial.object_pos,
+        trial.object_quat,
+        problem,
+        0,
+        ErrorLimits.of("sr_mt_obj_x0.5"),
+    )
     np.testing.assert_allclose(strict.pos, 1.0, atol=1e-5)
     assert ErrorLimits.of("sr_loose").pos == Limits().loose_pos
 

@@ -24,7 +24,7 @@ from flashdex.rollouts.rollout import MAX_FILE, Rollout
 from flashdex.rollouts.scorer import live_with_parent
 from flashdex.search.costs import ErrorLimits, shares
 from flashdex.search.plan import Planner
-from flashdex.search.problem import Problem, Trial
+from flashdex.search.problem import Problem
 from flashdex.search.simulate import make_simulator
 from flashdex.system.arrays import hash_content
 from flashdex.training.build import RunBuilder
@@ -97,7 +97,7 @@ class Worker:
             raise RunError(f"{path}: holds no controls of this motion's scene.")
         poses = rollout.object_pos, rollout.object_quat
         pos, quat = (x[None, None, : len(ctrl), problem.slots] for x in poses)
-        error = shares(Trial(pos, quat, pos, pos), problem, 0, self.limits).worst[0, 0]
+        error = shares(pos, quat, problem, 0, self.limits).worst[0, 0]
         near = np.flatnonzero(error <= 1)
         return problem.residuals(ctrl)[: near.max(initial=0) + 1]
 

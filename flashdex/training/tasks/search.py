@@ -115,8 +115,7 @@ def _run(task: TrackingTask, hold: RunHold, overrides: list[str]) -> Path:
         found = expect_kind(task.recipe, SearchRecipe, where=str(run_dir)).search
         on_gpu = found.engine == "warp" and torch.cuda.is_available()
         ledger = task.open_ledger(run_dir, source="search", on_gpu=on_gpu)
-        lines = read_ledger(ledger.path)
-        done = lines[-1]["env_steps"] if lines else 0
+        done = ledger.newest.get("env_steps", 0)
         start = begin_session(run_dir, env_steps=done, wall_s=0.0, overrides=overrides)
         ledger.adopt(wall_s=start.wall_s)
         log = MetricLog(run_dir, task.recipe)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flashdex.errors import RunError
-from flashdex.metrics.tally import Tally, follow_misses
+from flashdex.metrics.tally import Tally
 from flashdex.recipe import Recipe, expect_kind
 from flashdex.rollouts.findings import differences
 from flashdex.rollouts.ledger import CONVERSIONS, check_line, read_ledger
@@ -75,15 +75,11 @@ def read_source(source: Path, recipe: Recipe, contents: Mapping[str, str]) -> So
     names = [name for name in contents if name in known]
     lines = read_ledger(own_file(source, CONVERSIONS))
     tally = Tally(names, recipe.train.criterion, lines)
-    misses: dict[str, dict[str, Any]] = {}
-    for line in lines:
-        if line["criterion"] == recipe.train.criterion:
-            follow_misses(misses, line)
     done = {name: tally.conversions[name] for name in tally.done}
     return Source(
         run_id(source),
         {name: str(line.get("rollout_sha256") or "") for name, line in done.items()},
-        {n: line for n, line in misses.items() if n in names and n not in done},
+        {name: line for name, line in tally.misses.items() if name not in done},
     )
 
 

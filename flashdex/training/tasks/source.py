@@ -144,7 +144,7 @@ def forget_source(run_dir: Path) -> None:
     """Remove what a search that never began has left in its folder."""
     remove_own(run_dir, SOURCE)
     for path in own_files(run_dir, STARTS, "*.npz"):
-        path.unlink()
+        remove_own(run_dir, STARTS, path.name)
 
 
 def _is_file_of(line: Mapping[str, Any], path: Path) -> bool:
